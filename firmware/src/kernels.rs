@@ -1,0 +1,337 @@
+//! The kernel interface: one method per operator, each taking a checked view of its step, disjoint operands and its
+//! scratch. Every default is [`portable`], the norm that any other backend must equal byte for byte.
+//!
+//! A backend is a zero-sized token, proof that its instructions exist. It lists the [`KernelId`]s that it can read and
+//! overrides the methods that it accelerates. Methods are infallible: `Image::parse` has proved shapes, lengths and
+//! alignment, and all arithmetic is total (hostile constants give wrong numbers, never a panic).
+
+use crate::program::{Clamp, KernelId, Requant, Window};
+use crate::tensor::{Codes, CodesMut, Shape};
+
+pub mod plan;
+pub mod portable;
+
+/// Arrays per output channel of a [`crate::program::Rescale`]; all of the output channel count.
+#[derive(Clone, Copy, Debug)]
+pub struct RescaleArgs<'a> {
+    /// `p`.
+    pub pre_shift: u32,
+    /// `b'`.
+    pub bias: &'a [i32],
+    /// `M`.
+    pub multipliers: &'a [i32],
+    /// `n`.
+    pub shifts: &'a [u8],
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+    /// Second term.
+    pub residual: ResidualArgs<'a>,
+}
+
+/// Second term of the epilogue; `None` codes mean that the operand lies in the output buffer (in place).
+#[derive(Clone, Copy, Debug)]
+pub enum ResidualArgs<'a> {
+    /// No second term.
+    None,
+    /// `(r − z_r)·M_r` inside the rounding.
+    Scaled {
+        /// `r`, or in place.
+        codes: Option<Codes<'a>>,
+        /// `z_r`.
+        zero_point: i16,
+        /// `M_r` per output channel.
+        multipliers: &'a [i32],
+    },
+    /// `r` added after the rounding.
+    Stream {
+        /// `r`, or in place.
+        codes: Option<Codes<'a>>,
+    },
+}
+
+/// Arguments of [`Kernels::conv2d`].
+#[derive(Clone, Copy, Debug)]
+pub struct Conv2dArgs<'a> {
+    /// Input shape.
+    pub input_shape: Shape,
+    /// Output shape.
+    pub output_shape: Shape,
+    /// Kernel, stride, padding, dilation.
+    pub window: Window,
+    /// Channel groups.
+    pub groups: u16,
+    /// Packing of `weights`.
+    pub kernel: KernelId,
+    /// Packed weights.
+    pub weights: &'a [i8],
+    /// Padding code per input channel.
+    pub padding_codes: &'a [i8],
+    /// Epilogue.
+    pub rescale: RescaleArgs<'a>,
+}
+
+/// Arguments of [`Kernels::linear`].
+#[derive(Clone, Copy, Debug)]
+pub struct LinearArgs<'a> {
+    /// Rows of the product.
+    pub positions: u32,
+    /// Input channels (depth).
+    pub inputs: u16,
+    /// Output channels.
+    pub outputs: u16,
+    /// Packing of `weights`.
+    pub kernel: KernelId,
+    /// Packed weights.
+    pub weights: &'a [i8],
+    /// 64-bit accumulators.
+    pub wide: bool,
+    /// Epilogue.
+    pub rescale: RescaleArgs<'a>,
+}
+
+/// Arguments of [`Kernels::max_pool`] and [`Kernels::average_pool`].
+#[derive(Clone, Copy, Debug)]
+pub struct PoolArgs {
+    /// Input shape.
+    pub input_shape: Shape,
+    /// Output shape.
+    pub output_shape: Shape,
+    /// Kernel, stride, padding.
+    pub window: Window,
+}
+
+/// One-factor epilogue: `y = clamp(z_o + R((Σ…)·M, n))` with the operand's zero point.
+#[derive(Clone, Copy, Debug)]
+pub struct RequantArgs {
+    /// Zero point of the operand.
+    pub input_zero_point: i16,
+    /// M, n.
+    pub requant: Requant,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// One stored operand of a sum. `None` codes: it lies in the output buffer (in place).
+#[derive(Clone, Copy, Debug)]
+pub struct TermArgs<'a> {
+    /// The codes, or in place.
+    pub codes: Option<Codes<'a>>,
+    /// Zero point.
+    pub zero_point: i16,
+    /// `M_k`.
+    pub multiplier: i32,
+}
+
+/// Common end of a sum of terms: `clamp(z_o + R(Σ, n))`.
+#[derive(Clone, Copy, Debug)]
+pub struct SumArgs {
+    /// n.
+    pub shift: u32,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// Arguments of [`Kernels::resize_bilinear`].
+#[derive(Clone, Copy, Debug)]
+pub struct ResizeArgs<'a> {
+    /// Shape of the small map.
+    pub input_shape: Shape,
+    /// Shape of the output.
+    pub output_shape: Shape,
+    /// The small map (never in place).
+    pub input: TermArgs<'a>,
+    /// Map to add, if any.
+    pub residual: Option<TermArgs<'a>>,
+    /// `[i0, w1]` per output row.
+    pub rows: &'a [[u16; 2]],
+    /// `[i0, w1]` per output column.
+    pub columns: &'a [[u16; 2]],
+    /// w.
+    pub weight_bits: u32,
+    /// End of the sum.
+    pub sum: SumArgs,
+}
+
+/// One map of [`Kernels::tokens`].
+#[derive(Clone, Copy, Debug)]
+pub struct TokenSourceArgs<'a> {
+    /// Codes of the map.
+    pub codes: Codes<'a>,
+    /// Shape of the map.
+    pub shape: Shape,
+    /// `z`.
+    pub zero_point: i16,
+    /// Pooling window, vertical and horizontal.
+    pub pool: [u8; 2],
+    /// `M`.
+    pub multiplier: i32,
+}
+
+/// Arguments of [`Kernels::tokens`].
+#[derive(Clone, Copy, Debug)]
+pub struct TokensArgs<'a> {
+    /// The two maps, in token order.
+    pub sources: [TokenSourceArgs<'a>; 2],
+    /// Velocity, Q8 m/s.
+    pub velocity: i16,
+    /// `U_c` per channel.
+    pub velocity_multipliers: &'a [i32],
+    /// `P_tc`, `[T][C]`.
+    pub position: &'a [i16],
+    /// End of the sum; `P_tc` is added after the rounding.
+    pub sum: SumArgs,
+}
+
+/// Arguments of [`Kernels::layer_norm`].
+#[derive(Clone, Copy, Debug)]
+pub struct LayerNormArgs<'a> {
+    /// Rows to normalize (the input slice starts at the first of them).
+    pub rows: u32,
+    /// C.
+    pub channels: u16,
+    /// E.
+    pub epsilon: i64,
+    /// `G_i`.
+    pub gains: &'a [i32],
+    /// `B_i`.
+    pub offsets: &'a [i64],
+    /// End of the sum.
+    pub sum: SumArgs,
+}
+
+/// Arguments of [`Kernels::attention`].
+#[derive(Clone, Copy, Debug)]
+pub struct AttentionArgs<'a> {
+    /// Rows of q, k, v and the output.
+    pub tokens: u32,
+    /// C.
+    pub channels: u16,
+    /// Heads.
+    pub heads: u16,
+    /// `M_u`, `n_u`.
+    pub exponent: Requant,
+    /// 257 entries.
+    pub exp_table: &'a [i16],
+    /// M, n, with zero point and clamp of the output.
+    pub requant: RequantArgs,
+}
+
+/// Arguments of [`Kernels::waypoint_decoder`]; see [`crate::program::WaypointDecoder`] for shapes.
+#[derive(Clone, Copy, Debug)]
+#[allow(missing_docs, reason = "field for field the step's, with ranges resolved")]
+pub struct WaypointDecoderArgs<'a> {
+    pub hidden_size: u16,
+    pub steps: u16,
+    pub hidden_fraction_bits: u32,
+    pub concat: bool,
+    pub input_weights: &'a [i16],
+    pub hidden_weights: &'a [i16],
+    pub input_pre_shift: u32,
+    pub hidden_pre_shift: u32,
+    pub input_multipliers: &'a [i32],
+    pub hidden_multipliers: &'a [i32],
+    pub shifts: &'a [u8],
+    pub biases: &'a [i64],
+    pub output_weights: &'a [i16],
+    pub output_bias: &'a [i64],
+    pub output_pre_shift: u32,
+    pub output_requant: [Requant; 2],
+    pub tanh_table: &'a [i16],
+}
+
+/// One method per operator; see the module page. Operand layouts are those of [`crate::tensor`].
+pub trait Kernels {
+    /// The kernels that this backend can read.
+    const KERNELS: &'static [KernelId];
+
+    /// Convolution. `scratch`: [`plan::conv2d_scratch_bytes`], 16-byte aligned.
+    fn conv2d(&self, args: &Conv2dArgs<'_>, input: &[i8], output: CodesMut<'_>, scratch: &mut [u8]) {
+        portable::conv2d::conv2d(args, input, output, scratch);
+    }
+
+    /// Matrix product per position. `scratch`: [`plan::linear_scratch_bytes`].
+    fn linear(&self, args: &LinearArgs<'_>, input: Codes<'_>, output: CodesMut<'_>, scratch: &mut [u8]) {
+        portable::linear::linear(args, input, output, scratch);
+    }
+
+    /// Max pool. `input` is `None` in place: then `output` holds the whole input and its front receives the result.
+    fn max_pool(&self, args: &PoolArgs, input: Option<Codes<'_>>, output: CodesMut<'_>) {
+        portable::pool::max_pool(args, input, output);
+    }
+
+    /// Average pool over full windows.
+    fn average_pool(&self, args: &PoolArgs, requant: &RequantArgs, input: Codes<'_>, output: CodesMut<'_>) {
+        portable::pool::average_pool(args, requant, input, output);
+    }
+
+    /// Mean over all positions of the maps (all of `channels` channels), added.
+    fn global_pool(&self, channels: u16, sum: &SumArgs, terms: &[TermArgs<'_>], output: CodesMut<'_>) {
+        portable::pool::global_pool(channels, sum, terms, output);
+    }
+
+    /// Element-wise sum.
+    fn add(&self, sum: &SumArgs, terms: &[TermArgs<'_>; 2], output: CodesMut<'_>) {
+        portable::elementwise::add(sum, terms, output);
+    }
+
+    /// Change of scale or type.
+    fn requantize(&self, args: &RequantArgs, input: Codes<'_>, output: CodesMut<'_>) {
+        portable::elementwise::requantize(args, input, output);
+    }
+
+    /// Bilinear enlargement, with an optional sum.
+    fn resize_bilinear(&self, args: &ResizeArgs<'_>, output: CodesMut<'_>) {
+        portable::resize_bilinear::resize_bilinear(args, output);
+    }
+
+    /// Pooled maps, velocity and position to tokens.
+    fn tokens(&self, args: &TokensArgs<'_>, output: CodesMut<'_>) {
+        portable::tokens::tokens(args, output);
+    }
+
+    /// LayerNorm per row.
+    fn layer_norm(&self, args: &LayerNormArgs<'_>, input: Codes<'_>, output: CodesMut<'_>) {
+        portable::layer_norm::layer_norm(args, input, output);
+    }
+
+    /// Attention. `query` is `None` in place: then `output` holds the queries. `scratch`:
+    /// [`plan::attention_scratch_bytes`].
+    fn attention(
+        &self,
+        args: &AttentionArgs<'_>,
+        query: Option<&[i8]>,
+        key: &[i8],
+        value: &[i8],
+        output: CodesMut<'_>,
+        scratch: &mut [u8],
+    ) {
+        portable::attention::attention(args, query, key, value, output, scratch);
+    }
+
+    /// GRU and output layer. `goal`: two Q16 values; `waypoints`: `2·steps` Q16 values. `scratch`:
+    /// [`plan::waypoint_decoder_scratch_bytes`].
+    fn waypoint_decoder(
+        &self,
+        args: &WaypointDecoderArgs<'_>,
+        hidden: &[i16],
+        goal: &[i32],
+        waypoints: &mut [i32],
+        scratch: &mut [u8],
+    ) {
+        portable::waypoint_decoder::waypoint_decoder(args, hidden, goal, waypoints, scratch);
+    }
+}
+
+/// The norm: plain Rust, any target.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Portable;
+
+impl Kernels for Portable {
+    const KERNELS: &'static [KernelId] = &[KernelId::Direct];
+}

@@ -1,0 +1,519 @@
+//! The program section: one typed [`Step`] per operator, stored as postcard and decoded one at a time (no RAM).
+//!
+//! A step names tensors by [`TensorId`] and constants by [`ConstRange`]. Shapes and element types of operands are in
+//! the tensor table and are not repeated here; a step holds only what the table cannot say. All integer rules
+//! (`R(v, n)`, requantize, epilogues) are those of [`crate::fixed_point`].
+//!
+//! Evolution: a variant is never changed, only added at the end, and each kind has a feature bit
+//! ([`Step::feature`]), so an older runtime refuses a newer image by name.
+
+use crate::tensor::TensorId;
+use serde::{Deserialize, Serialize};
+
+/// A byte range of the constants section, 16-byte aligned, little-endian elements.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct ConstRange {
+    /// First byte, relative to the constants section; a multiple of 16.
+    pub offset: u32,
+    /// Length in bytes, without padding.
+    pub bytes: u32,
+}
+
+/// Algorithm and packing of one weighted step: weights, bias and multipliers are stored in this kernel's order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum KernelId {
+    /// Canonical order: weights `[output][kh][kw][input]` (`[output][input]` for linear), depth contiguous.
+    Direct,
+}
+
+/// Kernel size, stride, explicit padding and dilation of a sliding window, in pixels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Window {
+    /// Kernel height.
+    pub kernel_h: u8,
+    /// Kernel width.
+    pub kernel_w: u8,
+    /// Vertical stride.
+    pub stride_h: u8,
+    /// Horizontal stride.
+    pub stride_w: u8,
+    /// Rows of padding above.
+    pub pad_top: u8,
+    /// Rows of padding below.
+    pub pad_bottom: u8,
+    /// Columns of padding on the left.
+    pub pad_left: u8,
+    /// Columns of padding on the right.
+    pub pad_right: u8,
+    /// Vertical distance of taps.
+    pub dilation_h: u8,
+    /// Horizontal distance of taps.
+    pub dilation_w: u8,
+}
+
+impl Window {
+    /// Output height and width over an input of `height × width`, or `None` where the window does not fit or a field
+    /// is zero: `out = (in + pads − dilation·(kernel − 1) − 1) / stride + 1`.
+    pub fn output_size(&self, height: u16, width: u16) -> Option<(u16, u16)> {
+        fn axis(size: u16, before: u8, after: u8, kernel: u8, dilation: u8, stride: u8) -> Option<u16> {
+            if kernel == 0 || dilation == 0 || stride == 0 {
+                return None;
+            }
+            let padded = u32::from(size) + u32::from(before) + u32::from(after);
+            let reach = u32::from(dilation) * (u32::from(kernel) - 1) + 1;
+            let steps = padded.checked_sub(reach)? / u32::from(stride);
+            u16::try_from(steps + 1).ok()
+        }
+        let h = axis(height, self.pad_top, self.pad_bottom, self.kernel_h, self.dilation_h, self.stride_h)?;
+        let w = axis(width, self.pad_left, self.pad_right, self.kernel_w, self.dilation_w, self.stride_w)?;
+        Some((h, w))
+    }
+}
+
+/// Saturation bounds of an output, in codes; ReLU is a lower bound equal to the zero point.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Clamp {
+    /// Smallest code.
+    pub min: i16,
+    /// Largest code.
+    pub max: i16,
+}
+
+/// One factor for all channels: `R(v · multiplier, shift)`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Requant {
+    /// Integer factor; in `[2^23, 2^24)` where it stands alone, below `2^31` as a term of a sum.
+    pub multiplier: i32,
+    /// Right shift, 0..=52.
+    pub shift: u8,
+}
+
+/// How the accumulators of a weighted step become output codes. Arrays are per output channel.
+///
+/// With `t = R(acc, pre_shift)`, `acc = bias + Σ w·q`:
+/// * `Requant`: `y = clamp(z_o + R(t·M, n))`, M in `[2^23, 2^24)`, n in 1..=52
+/// * `Residual`: `y = clamp(z_o + R(t·M + (r − z_r)·M_r, n))`, one rounding, M and M_r below 2^31, n ≤ 40
+/// * `Stream`: `y = clamp(r + R(t·M, n))`, r and y of the same scale
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Rescale {
+    /// `p`: right shift of the accumulator before the multiplication, 0..=36.
+    pub pre_shift: u8,
+    /// `i32` per output channel: the effective bias `b'`.
+    pub bias: ConstRange,
+    /// `i32` per output channel: `M`.
+    pub multipliers: ConstRange,
+    /// `u8` per output channel: `n`.
+    pub shifts: ConstRange,
+    /// `z_o`, the output's zero point.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+    /// The second term, if any.
+    pub residual: Residual,
+}
+
+/// Second term of a [`Rescale`].
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Residual {
+    /// None: plain requantization.
+    None,
+    /// A stored operand with its own scale.
+    Scaled {
+        /// `r`, shaped like the output. May be the tensor that the output overwrites.
+        tensor: TensorId,
+        /// `z_r`.
+        zero_point: i16,
+        /// `i32` per output channel: `M_r`.
+        multipliers: ConstRange,
+    },
+    /// A stored operand of the output's own scale: the factor is exactly 1.
+    Stream {
+        /// `r`, shaped like the output. May be the tensor that the output overwrites.
+        tensor: TensorId,
+    },
+}
+
+/// `acc = bias + Σ w·q` over a window; see [`Rescale`] for what follows. i8 input, i8 weights, i32 accumulator.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Conv2d {
+    /// i8 map `H×W×C`.
+    pub input: TensorId,
+    /// i8 or i16 map.
+    pub output: TensorId,
+    /// Kernel, stride, padding, dilation.
+    pub window: Window,
+    /// Channel groups: input and output channels are both divided by it.
+    pub groups: u16,
+    /// Packing of `weights`.
+    pub kernel: KernelId,
+    /// `i8` weights, `[O][kh][kw][C/groups]` in canonical order.
+    pub weights: ConstRange,
+    /// `i8` per input channel: the code that stands for padding.
+    pub padding_codes: ConstRange,
+    /// From accumulator to output code.
+    pub rescale: Rescale,
+    /// Working memory of the kernel.
+    pub scratch: Option<TensorId>,
+}
+
+/// `acc = bias + Σ w·q` per position: matrix product over the channels. i8 or i16 input, i8 weights.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Linear {
+    /// i8 or i16, `positions × I`.
+    pub input: TensorId,
+    /// i8 or i16, `positions × O`.
+    pub output: TensorId,
+    /// Packing of `weights`.
+    pub kernel: KernelId,
+    /// `i8` weights `[O][I]`.
+    pub weights: ConstRange,
+    /// Accumulate in 64 bits (the compiler's bound exceeds 31 bits).
+    pub wide: bool,
+    /// From accumulator to output code.
+    pub rescale: Rescale,
+    /// Working memory of the kernel.
+    pub scratch: Option<TensorId>,
+}
+
+/// Largest code of each window; padding never wins. Input and output have the same type, scale and channels.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct MaxPool {
+    /// i8 or i16 map.
+    pub input: TensorId,
+    /// Map of the same type; may overwrite the input where row order allows.
+    pub output: TensorId,
+    /// Kernel, stride, padding (dilation 1).
+    pub window: Window,
+}
+
+/// `y = clamp(z_o + R(Σ(q − z)·M, n))` over full windows, in the output's own scale.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct AveragePool {
+    /// i8 or i16 map.
+    pub input: TensorId,
+    /// i8 or i16 map.
+    pub output: TensorId,
+    /// Kernel and stride (no padding, dilation 1).
+    pub window: Window,
+    /// `z`.
+    pub input_zero_point: i16,
+    /// `M = s_x / (s_o · N)` and n.
+    pub requant: Requant,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// One stored operand of a sum: `(q − zero_point) · multiplier`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Term {
+    /// The operand.
+    pub tensor: TensorId,
+    /// Its zero point.
+    pub zero_point: i16,
+    /// `M_k < 2^31`.
+    pub multiplier: i32,
+}
+
+/// Mean over all positions of one or two maps, added: `y_c = clamp(z_o + R(Σ_k M_k·Σ_p (q_kpc − z_k), n))`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GlobalPool {
+    /// First map.
+    pub first: Term,
+    /// Second map of the same channel count, if any.
+    pub second: Option<Term>,
+    /// Vector `1×1×C`.
+    pub output: TensorId,
+    /// n, at most 40.
+    pub shift: u8,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// Sum of two operands of the same shape: `y = clamp(z_o + R((a − z_a)·M_a + (b − z_b)·M_b, n))`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Add {
+    /// First operand.
+    pub first: Term,
+    /// Second operand.
+    pub second: Term,
+    /// i8 or i16; may overwrite either operand of the same element type.
+    pub output: TensorId,
+    /// n, at most 40.
+    pub shift: u8,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// Change of scale or type: `y = clamp(z_o + R((q − z)·M, n))`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Requantize {
+    /// i8 or i16.
+    pub input: TensorId,
+    /// i8 or i16, same shape.
+    pub output: TensorId,
+    /// `z`.
+    pub input_zero_point: i16,
+    /// M and n.
+    pub requant: Requant,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// Bilinear enlargement by a whole factor with half-pixel centers, optionally added to a map of the output's size.
+///
+/// Per axis, output index d reads rows `i0(d)`, `i1 = min(i0+1, last)` with weights `2^w − w1(d)` and `w1(d)`, stored in
+/// `rows` / `columns` as pairs `(i0: u16, w1: u16)`. `t = R(Σ wy·wx·(q − z), 2w − 8)` (1/256 of the input LSB);
+/// `y = clamp(z_o + R(t·M + (r − z_r)·M_r, n))`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ResizeBilinear {
+    /// The small map (its multiplier is `s_x/s_o·2^-8`).
+    pub input: Term,
+    /// Map of the output's shape to add.
+    pub residual: Option<Term>,
+    /// i8 or i16; may overwrite the residual of the same element type.
+    pub output: TensorId,
+    /// `(i0: u16, w1: u16)` per output row.
+    pub rows: ConstRange,
+    /// `(i0: u16, w1: u16)` per output column.
+    pub columns: ConstRange,
+    /// w, 4..=11.
+    pub weight_bits: u8,
+    /// n, at most 40.
+    pub shift: u8,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// One map that becomes tokens: it is average-pooled to the token grid.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct TokenSource {
+    /// i8 or i16 map `H×W×C`.
+    pub map: TensorId,
+    /// `z` of the map.
+    pub zero_point: i16,
+    /// Pooling window and stride, vertical (divides H).
+    pub pool_h: u8,
+    /// Pooling window and stride, horizontal (divides W).
+    pub pool_w: u8,
+    /// `M`, of `s_map / (s_x·N)`, N = pool_h·pool_w.
+    pub multiplier: i32,
+}
+
+/// Tokens of up to two maps with positional embedding and velocity, straight into the residual stream:
+/// `x_tc = clamp(z_o + R(Σ(q − z)·M + v·U_c, n) + P_tc)`; tokens of `first` come first.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Tokens {
+    /// First map (camera).
+    pub first: TokenSource,
+    /// Second map (LiDAR).
+    pub second: TokenSource,
+    /// i16 Q8 m/s, one value.
+    pub velocity: TensorId,
+    /// `T×C`, i16 (or i8).
+    pub output: TensorId,
+    /// `i32` per channel: `U_c`.
+    pub velocity_multipliers: ConstRange,
+    /// `i16` `[T][C]`: `P_tc`.
+    pub position: ConstRange,
+    /// n, at most 40.
+    pub shift: u8,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// LayerNorm over the channels of rows `first_row ..` of a stream; as many rows as the output has positions.
+///
+/// `S = Σx; V = C·Σx² − S² + E; h = max(0, (52 − bits(V)) >> 1); σ = isqrt(V << 2h); R_σ = floor(2^47/σ);`
+/// `t_i = R((C·x_i − S)·R_σ, 33 − h)` (Q14); `y_i = clamp(z_o + R(t_i·G_i + B_i, n))`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LayerNorm {
+    /// i16 (or i8) stream `T×C`, C ≤ 1024.
+    pub input: TensorId,
+    /// i8 or i16; any shape with C channels.
+    pub output: TensorId,
+    /// First row of the input that is read.
+    pub first_row: u16,
+    /// E, at least 1.
+    pub epsilon: i64,
+    /// `i32` per channel: `G_i`, |G| < 2^24.
+    pub gains: ConstRange,
+    /// `i64` per channel: `B_i`, |B| < 2^51.
+    pub offsets: ConstRange,
+    /// n, at most 40.
+    pub shift: u8,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// Multi-head attention over all rows, streamed one query row at a time (no N×N map); numerics in [`crate::ops`].
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Attention {
+    /// Queries, i8 symmetric `T×C`.
+    pub query: TensorId,
+    /// Keys, i8 symmetric `T×C`.
+    pub key: TensorId,
+    /// Values, i8 symmetric `T×C`.
+    pub value: TensorId,
+    /// `T×C`, i8 or i16. May overwrite the queries (same type): a row is written after its last use.
+    pub output: TensorId,
+    /// Number of heads; divides C. Head h uses channels `h·C/heads ..`.
+    pub heads: u16,
+    /// `M_u`, `n_u`: distance from the maximum to base-2 exponent, Q16.
+    pub exponent: Requant,
+    /// 257 × `i16`: `T[k] = min(32767, round(2^15·2^(−k/256)))`.
+    pub exp_table: ConstRange,
+    /// M, n of `s_v/s_o·2^-12`.
+    pub requant: Requant,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+    /// Working memory: one row of probabilities per head.
+    pub scratch: Option<TensorId>,
+}
+
+/// GRU that emits waypoints: `steps` iterations from the hidden state `h0` (gate order r, z, n).
+///
+/// H = hidden size, U = 2 (waypoint + goal added) or 4 (concatenated), rows stacked r, z, n.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct WaypointDecoder {
+    /// `h0`, i16 vector of H values, scale `2^-hidden_fraction_bits`.
+    pub hidden: TensorId,
+    /// Goal, i32 Q16 m, `[right, forward-negative]`.
+    pub goal: TensorId,
+    /// Waypoints, i32 Q16 m, `steps×1×2`.
+    pub output: TensorId,
+    /// `f`, at most 15.
+    pub hidden_fraction_bits: u8,
+    /// Concatenate waypoint and goal (U = 4) instead of adding them (U = 2).
+    pub concat: bool,
+    /// `i16` `[3H][U]`.
+    pub input_weights: ConstRange,
+    /// `i16` `[3H][H]`.
+    pub hidden_weights: ConstRange,
+    /// `p_x`.
+    pub input_pre_shift: u8,
+    /// `p_h`.
+    pub hidden_pre_shift: u8,
+    /// `i32` `[3H]`: `Mx`.
+    pub input_multipliers: ConstRange,
+    /// `i32` `[3H]`: `Mh`.
+    pub hidden_multipliers: ConstRange,
+    /// `u8` `[3H]`: n, at most 30.
+    pub shifts: ConstRange,
+    /// `i64` `[4H]`: B of the r rows, B of the z rows, B_i of the n rows, B_h of the n rows.
+    pub biases: ConstRange,
+    /// `i16` `[2][H]`.
+    pub output_weights: ConstRange,
+    /// `i64` `[2]`: b'.
+    pub output_bias: ConstRange,
+    /// p of the output layer.
+    pub output_pre_shift: u8,
+    /// M, n of the two output rows (to Q16 m).
+    pub output_requant: [Requant; 2],
+    /// 513 × `i16`: `T[k] = min(32767, round(2^15·tanh(k/64)))`.
+    pub tanh_table: ConstRange,
+    /// Working memory: two hidden states.
+    pub scratch: Option<TensorId>,
+}
+
+/// One operator of the program, in the order of execution.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant, reason = "decoded one at a time on the stack, never stored in bulk on the target")]
+#[allow(missing_docs, reason = "each variant is documented at its struct")]
+pub enum Step {
+    Conv2d(Conv2d),
+    Linear(Linear),
+    MaxPool(MaxPool),
+    AveragePool(AveragePool),
+    GlobalPool(GlobalPool),
+    Add(Add),
+    Requantize(Requantize),
+    ResizeBilinear(ResizeBilinear),
+    Tokens(Tokens),
+    LayerNorm(LayerNorm),
+    Attention(Attention),
+    WaypointDecoder(WaypointDecoder),
+}
+
+impl Step {
+    /// Operator name as reports print it.
+    pub const fn name(&self) -> &'static str {
+        match self {
+            Self::Conv2d(_) => "conv2d",
+            Self::Linear(_) => "linear",
+            Self::MaxPool(_) => "max_pool",
+            Self::AveragePool(_) => "average_pool",
+            Self::GlobalPool(_) => "global_pool",
+            Self::Add(_) => "add",
+            Self::Requantize(_) => "requantize",
+            Self::ResizeBilinear(_) => "resize_bilinear",
+            Self::Tokens(_) => "tokens",
+            Self::LayerNorm(_) => "layer_norm",
+            Self::Attention(_) => "attention",
+            Self::WaypointDecoder(_) => "waypoint_decoder",
+        }
+    }
+
+    /// Bit of the header's `features` word that an image with this step must set.
+    pub const fn feature(&self) -> u64 {
+        1 << match self {
+            Self::Conv2d(_) => 0,
+            Self::Linear(_) => 1,
+            Self::MaxPool(_) => 2,
+            Self::AveragePool(_) => 3,
+            Self::GlobalPool(_) => 4,
+            Self::Add(_) => 5,
+            Self::Requantize(_) => 6,
+            Self::ResizeBilinear(_) => 7,
+            Self::Tokens(_) => 8,
+            Self::LayerNorm(_) => 9,
+            Self::Attention(_) => 10,
+            Self::WaypointDecoder(_) => 11,
+        }
+    }
+
+    /// The tensor that the step writes.
+    pub const fn output(&self) -> TensorId {
+        match self {
+            Self::Conv2d(s) => s.output,
+            Self::Linear(s) => s.output,
+            Self::MaxPool(s) => s.output,
+            Self::AveragePool(s) => s.output,
+            Self::GlobalPool(s) => s.output,
+            Self::Add(s) => s.output,
+            Self::Requantize(s) => s.output,
+            Self::ResizeBilinear(s) => s.output,
+            Self::Tokens(s) => s.output,
+            Self::LayerNorm(s) => s.output,
+            Self::Attention(s) => s.output,
+            Self::WaypointDecoder(s) => s.output,
+        }
+    }
+
+    /// The step's working memory, if any.
+    pub const fn scratch(&self) -> Option<TensorId> {
+        match self {
+            Self::Conv2d(s) => s.scratch,
+            Self::Linear(s) => s.scratch,
+            Self::Attention(s) => s.scratch,
+            Self::WaypointDecoder(s) => s.scratch,
+            _ => None,
+        }
+    }
+}

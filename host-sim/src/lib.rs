@@ -1,0 +1,2 @@
+//! Runs the firmware's engine on the host.
+#![forbid(unsafe_code)]

@@ -1,0 +1,181 @@
+//! Shape rules and the checklist of graph invariants.
+
+use super::{Op, Shape};
+
+fn arity(op: &Op, inputs: &[Shape], allowed: std::ops::RangeInclusive<usize>) -> Result<(), String> {
+    if allowed.contains(&inputs.len()) {
+        return Ok(());
+    }
+    Err(format!("{} takes {allowed:?} operands, found {}", op.name(), inputs.len()))
+}
+
+fn expect(what: &str, found: impl PartialEq<usize> + std::fmt::Debug, expected: usize) -> Result<(), String> {
+    if found == expected { Ok(()) } else { Err(format!("{what}: found {found:?}, expected {expected}")) }
+}
+
+fn same_shape(what: &str, found: Shape, expected: Shape) -> Result<(), String> {
+    if found == expected { Ok(()) } else { Err(format!("{what}: found {found:?}, expected {expected:?}")) }
+}
+
+fn narrow(what: &str, value: usize) -> Result<u16, String> {
+    u16::try_from(value).map_err(|_| format!("{what}: {value} exceeds 65535"))
+}
+
+/// See [`Op::output_shape`].
+pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
+    let channels = |s: Shape| usize::from(s.channels);
+    let windowed = |window: &firmware::program::Window, s: Shape, c: u16| {
+        let (h, w) = window
+            .output_size(s.height, s.width)
+            .ok_or_else(|| format!("window {window:?} does not fit a map of {}×{}", s.height, s.width))?;
+        Ok::<_, String>(Shape::map(h, w, c))
+    };
+    match op {
+        Op::Input(_) => Err("an input has no operands to take its shape from".into()),
+        Op::Normalize(n) => {
+            arity(op, inputs, 1..=1)?;
+            expect("means", n.mean.len(), channels(inputs[0]))?;
+            expect("standard deviations", n.std.len(), channels(inputs[0]))?;
+            Ok(inputs[0])
+        }
+        Op::Conv2d(conv) => {
+            arity(op, inputs, 1..=2)?;
+            let w = &conv.weights.shape;
+            expect("rank of convolution weights", w.len(), 4)?;
+            expect("kernel height", w[1], usize::from(conv.window.kernel_h))?;
+            expect("kernel width", w[2], usize::from(conv.window.kernel_w))?;
+            expect("input channels", w[3] * usize::from(conv.groups), channels(inputs[0]))?;
+            if conv.groups == 0 || w[0] % usize::from(conv.groups) != 0 {
+                return Err(format!("{} output channels are not divisible by {} groups", w[0], conv.groups));
+            }
+            if let Some(bias) = &conv.bias {
+                expect("bias length", bias.len(), w[0])?;
+            }
+            let out = windowed(&conv.window, inputs[0], narrow("output channels", w[0])?)?;
+            if let Some(&residual) = inputs.get(1) {
+                same_shape("residual", residual, out)?;
+            }
+            Ok(out)
+        }
+        Op::BatchNorm(bn) => {
+            arity(op, inputs, 1..=1)?;
+            for v in [&bn.weight, &bn.bias, &bn.mean, &bn.variance] {
+                expect("batch-norm vector", v.len(), channels(inputs[0]))?;
+            }
+            Ok(inputs[0])
+        }
+        Op::Relu => {
+            arity(op, inputs, 1..=1)?;
+            Ok(inputs[0])
+        }
+        Op::Add { .. } => {
+            arity(op, inputs, 2..=2)?;
+            same_shape("second operand", inputs[1], inputs[0])?;
+            Ok(inputs[0])
+        }
+        Op::MaxPool(window) | Op::AveragePool(window) => {
+            arity(op, inputs, 1..=1)?;
+            windowed(window, inputs[0], inputs[0].channels)
+        }
+        Op::GlobalPool => {
+            arity(op, inputs, 1..=2)?;
+            if let Some(second) = inputs.get(1) {
+                expect("channels of the second map", second.channels as usize, channels(inputs[0]))?;
+            }
+            Ok(Shape::vector(inputs[0].channels))
+        }
+        Op::ResizeBilinear { factor } => {
+            arity(op, inputs, 1..=2)?;
+            let s = inputs[0];
+            let out = Shape::map(
+                narrow("height", usize::from(s.height) * usize::from(factor.0))?,
+                narrow("width", usize::from(s.width) * usize::from(factor.1))?,
+                s.channels,
+            );
+            if let Some(&residual) = inputs.get(1) {
+                same_shape("residual", residual, out)?;
+            }
+            Ok(out)
+        }
+        Op::Linear(linear) => {
+            arity(op, inputs, 1..=2)?;
+            let w = &linear.weights.shape;
+            expect("rank of linear weights", w.len(), 2)?;
+            expect("input channels", w[1], channels(inputs[0]))?;
+            if let Some(bias) = &linear.bias {
+                expect("bias length", bias.len(), w[0])?;
+            }
+            let out = Shape { channels: narrow("output channels", w[0])?, ..inputs[0] };
+            if let Some(&residual) = inputs.get(1) {
+                same_shape("residual", residual, out)?;
+            }
+            Ok(out)
+        }
+        Op::Tokens(tokens) => {
+            arity(op, inputs, 3..=3)?;
+            let (h, w) = tokens.grid;
+            for s in &inputs[..2] {
+                if h == 0 || w == 0 || s.height % h != 0 || s.width % w != 0 {
+                    return Err(format!("a map of {}×{} does not divide into {h}×{w} tokens", s.height, s.width));
+                }
+            }
+            expect("channels of the second map", inputs[1].channels as usize, channels(inputs[0]))?;
+            expect("velocity values", inputs[2].elements() as usize, 1)?;
+            let count = 2 * usize::from(h) * usize::from(w);
+            if let Some(p) = &tokens.position {
+                if p.shape != [count, channels(inputs[0])] {
+                    return Err(format!(
+                        "positional embedding: found {:?}, expected [{count}, {}]",
+                        p.shape, inputs[0].channels
+                    ));
+                }
+            }
+            for v in [&tokens.velocity_weights, &tokens.velocity_bias] {
+                expect("velocity embedding", v.len(), channels(inputs[0]))?;
+            }
+            Ok(Shape::tokens(narrow("tokens", count)?, inputs[0].channels))
+        }
+        Op::LayerNorm(norm) => {
+            arity(op, inputs, 1..=1)?;
+            expect("LayerNorm weight", norm.weight.len(), channels(inputs[0]))?;
+            expect("LayerNorm bias", norm.bias.len(), channels(inputs[0]))?;
+            let (h, w) = norm.grid;
+            let rows = u32::from(h) * u32::from(w);
+            if u32::from(norm.first_row) + rows > inputs[0].positions() {
+                return Err(format!("rows {} + {rows} exceed the input's {}", norm.first_row, inputs[0].positions()));
+            }
+            Ok(Shape::map(h, w, inputs[0].channels))
+        }
+        Op::Attention { heads } => {
+            arity(op, inputs, 3..=3)?;
+            same_shape("key", inputs[1], inputs[0])?;
+            same_shape("value", inputs[2], inputs[0])?;
+            if *heads == 0 || inputs[0].channels % heads != 0 {
+                return Err(format!("{} channels are not divisible by {heads} heads", inputs[0].channels));
+            }
+            Ok(inputs[0])
+        }
+        Op::WaypointDecoder(d) => {
+            arity(op, inputs, 2..=2)?;
+            let h = channels(inputs[0]);
+            let u = d.input_weights.shape.get(1).copied().unwrap_or(0);
+            if u != 2 && u != 4 {
+                return Err(format!("GRU input width: found {u}, expected 2 (added) or 4 (concatenated)"));
+            }
+            for (what, found, expected) in [
+                ("GRU input weights", &d.input_weights.shape, [3 * h, u]),
+                ("GRU hidden weights", &d.hidden_weights.shape, [3 * h, h]),
+                ("output weights", &d.output_weights.shape, [2, h]),
+            ] {
+                if found[..] != expected {
+                    return Err(format!("{what}: found {found:?}, expected {expected:?}"));
+                }
+            }
+            expect("GRU input bias", d.input_bias.len(), 3 * h)?;
+            expect("GRU hidden bias", d.hidden_bias.len(), 3 * h)?;
+            expect("output bias", d.output_bias.len(), 2)?;
+            expect("goal values", inputs[1].elements() as usize, 2)?;
+            Ok(Shape::tokens(d.steps, 2))
+        }
+    }
+}

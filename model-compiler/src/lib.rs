@@ -1,0 +1,18 @@
+//! Trained driving networks to int8 model images.
+#![forbid(unsafe_code)]
+
+pub mod calibrate;
+pub mod emit;
+pub mod error;
+pub mod import;
+pub mod integer_reference;
+pub mod ir;
+pub mod memory_plan;
+pub mod pack;
+pub mod passes;
+pub mod qmodel;
+pub mod quantize;
+pub mod record;
+pub mod reference;
+pub mod schedule;
+pub mod target;
