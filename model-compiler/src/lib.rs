@@ -4,6 +4,7 @@
 pub mod calibrate;
 pub mod emit;
 pub mod error;
+pub mod frames;
 pub mod import;
 pub mod integer_reference;
 pub mod ir;
