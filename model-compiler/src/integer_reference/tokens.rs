@@ -36,8 +36,7 @@ pub(super) fn tokens(
     }
     expect("elements of the tokens", sums.len(), operands.shape(output)?.elements() as usize)?;
     expect("positional embedding", embedding.position.len(), sums.len())?;
-    let speed: Vec<f64> =
-        to_f64(embedding.velocity_multipliers).iter().map(|u| exact.watch(velocity[0] * u)).collect();
+    let speed: Vec<f64> = to_f64(embedding.velocity_multipliers).iter().map(|u| exact.watch(velocity[0] * u)).collect();
     let code = |(element, sum): (usize, f64)| {
         let total = sum + speed[element % channels];
         requantizer.code_plus(total, f64::from(embedding.position[element]), &mut exact)
