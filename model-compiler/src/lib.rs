@@ -1,6 +1,7 @@
 //! Trained driving networks to int8 model images.
 #![forbid(unsafe_code)]
 
+pub mod artifact;
 pub mod calibrate;
 pub mod emit;
 pub mod error;
