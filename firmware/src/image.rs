@@ -180,6 +180,22 @@ impl<'a> Image<'a> {
         Port::from_bytes(bytes::record_at(self.section(SectionKind::Ports), position, layout::port::BYTES)?)
     }
 
+    /// Whether a tensor is an input of the network.
+    pub(crate) fn is_input(&self, id: TensorId) -> bool {
+        (0..self.input_count).any(|input| self.port_tensor(input.into()) == Some(id.0))
+    }
+
+    /// Whether a tensor is an output of the network.
+    pub(crate) fn is_output(&self, id: TensorId) -> bool {
+        let first = usize::from(self.input_count);
+        (0..self.output_count).any(|output| self.port_tensor(first.saturating_add(output.into())) == Some(id.0))
+    }
+
+    fn port_tensor(&self, position: usize) -> Option<u16> {
+        let record = bytes::record_at(self.section(SectionKind::Ports), position, layout::port::BYTES)?;
+        bytes::u16_at(record, layout::port::TENSOR)
+    }
+
     /// A tensor record; `None` behind the last.
     pub fn tensor(&self, id: TensorId) -> Option<TensorRecord> {
         TensorRecord::from_bytes(self.tensor_bytes(id)?)

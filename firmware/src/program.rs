@@ -495,7 +495,7 @@ impl Rescale {
 
 impl Step {
     /// Union of the feature bits of all step kinds and kernels of this format.
-    pub const KNOWN_FEATURES: u64 = (1 << 12) - 1 | KernelId::Direct.feature();
+    pub const KNOWN_FEATURES: u64 = ((1 << 12) - 1) | KernelId::Direct.feature();
 
     /// Operator name as reports print it.
     pub const fn name(&self) -> &'static str {

@@ -11,20 +11,21 @@ macro_rules! checks {
         #[cfg_attr(feature = "defmt", derive(defmt::Format))]
         #[repr(u16)]
         pub enum Check {
-            /// Holds number 0, which means "no check".
-            #[doc(hidden)]
-            Nothing,
             $(#[doc = $words] $name,)*
         }
 
         impl Check {
-            /// All checks, in order of their numbers from 1.
+            /// All checks in order of their numbers.
             pub const ALL: &'static [Self] = &[$(Self::$name),*];
+
+            /// 1, 2, …; what `fault::disable_check` takes.
+            pub const fn number(self) -> u16 {
+                (self as u16).saturating_add(1)
+            }
 
             /// What a failure means, in plain words.
             pub const fn words(self) -> &'static str {
                 match self {
-                    Self::Nothing => "",
                     $(Self::$name => $words,)*
                 }
             }
@@ -191,7 +192,7 @@ pub(crate) fn ensure(
     found: impl Into<i64>,
     expected: impl Into<i64>,
 ) -> Result<(), ParseError> {
-    if holds || crate::fault::check_disabled(check as u16) {
+    if holds || crate::fault::check_disabled(check.number()) {
         return Ok(());
     }
     Err(ParseError { check, place, found: found.into(), expected: expected.into() })

@@ -173,6 +173,6 @@ pub mod known_answer {
 }
 
 /// `length` rounded up to a multiple of [`ALIGNMENT`].
-pub const fn padded(length: u64) -> u64 {
-    (length.saturating_add(ALIGNMENT as u64 - 1) / ALIGNMENT as u64).saturating_mul(ALIGNMENT as u64)
+pub fn padded(length: u64) -> u64 {
+    length.checked_next_multiple_of(ALIGNMENT as u64).unwrap_or(u64::MAX)
 }
