@@ -10,6 +10,7 @@ pub mod import;
 pub mod integer_reference;
 pub mod ir;
 pub mod memory_plan;
+pub mod metrics;
 pub mod pack;
 pub mod passes;
 pub mod qmodel;

@@ -22,7 +22,7 @@ pub(super) struct Panels {
 }
 
 impl Panels {
-    /// From row-major `[outputs][depth]`.
+    /// Regroups row-major `[outputs][depth]`.
     pub(super) fn new(weights: &[f32], outputs: usize) -> Self {
         let depth = weights.len() / outputs;
         let mut data = vec![[0.0; LANES]; outputs.div_ceil(LANES) * depth];
@@ -37,18 +37,29 @@ impl Panels {
 
     /// `out[r·stride + first + o] = Σ_k rows[r][k]·weights[o][k]` for row-major `rows` of `depth` values each.
     pub(super) fn multiply(&self, rows: &[f32], out: &mut [f32], stride: usize, first: usize) {
-        pulp::Arch::new().dispatch(
-            #[inline(always)]
-            || self.multiply_here(rows, out, stride, first),
-        );
+        pulp::Arch::new().dispatch(Product { panels: self, rows, out, stride, first });
     }
+}
+
+/// The arguments of [`Panels::multiply`]. Its code is compiled once per instruction set, with everything inlined.
+struct Product<'a> {
+    panels: &'a Panels,
+    rows: &'a [f32],
+    out: &'a mut [f32],
+    stride: usize,
+    first: usize,
+}
+
+impl pulp::WithSimd for Product<'_> {
+    type Output = ();
 
     #[inline(always)]
-    fn multiply_here(&self, rows: &[f32], out: &mut [f32], stride: usize, first: usize) {
-        for (p, panel) in self.data.chunks_exact(self.depth).enumerate() {
+    fn with_simd<S: pulp::Simd>(self, _: S) {
+        let Self { panels: &Panels { outputs, depth, ref data }, rows, out, stride, first } = self;
+        for (p, panel) in data.chunks_exact(depth).enumerate() {
             let column = first + p * LANES;
-            let width = LANES.min(self.outputs - p * LANES);
-            let mut tiles = rows.chunks_exact(TILE * self.depth);
+            let width = LANES.min(outputs - p * LANES);
+            let mut tiles = rows.chunks_exact(TILE * depth);
             let mut r = 0;
             for tile in &mut tiles {
                 for sums in sums::<TILE>(tile, panel) {
@@ -56,7 +67,7 @@ impl Panels {
                     r += 1;
                 }
             }
-            for row in tiles.remainder().chunks_exact(self.depth) {
+            for row in tiles.remainder().chunks_exact(depth) {
                 let [sums] = sums::<1>(row, panel);
                 out[r * stride + column..][..width].copy_from_slice(&sums[..width]);
                 r += 1;
@@ -65,17 +76,17 @@ impl Panels {
     }
 }
 
-/// Products of `ROWS` rows with one panel.
+/// Products of `ROWS` rows with one panel. Counted loops, not iterators: these unroll, so the sums stay in registers.
 #[inline(always)]
 fn sums<const ROWS: usize>(rows: &[f32], panel: &[[f32; LANES]]) -> [[f32; LANES]; ROWS] {
     let depth = panel.len();
     let rows: [&[f32]; ROWS] = std::array::from_fn(|r| &rows[r * depth..][..depth]);
     let mut sums = [[0.0; LANES]; ROWS];
     for (k, weights) in panel.iter().enumerate() {
-        for (sums, row) in sums.iter_mut().zip(rows) {
-            let x = row[k];
-            for (sum, w) in sums.iter_mut().zip(weights) {
-                *sum += x * w;
+        let x: [f32; ROWS] = std::array::from_fn(|r| rows[r][k]);
+        for r in 0..ROWS {
+            for o in 0..LANES {
+                sums[r][o] += x[r] * weights[o];
             }
         }
     }
