@@ -210,7 +210,7 @@ mod tests {
             (r#"{"speed": 1, "goal": [1]}"#, "`goal`: found [1], expected [right_m, forward_m]"),
             (r#"{"speed": 1, "goal": [1, 2], "command": 7}"#, "`command`: found 7, expected 1..6"),
             (r#"{"speed": 1, "goal": [1, 2], "lidar_axes": "ouster"}"#, "`lidar_axes`: found \"ouster\""),
-            (r#"{"speed": 1e39, "goal": [1, 2]}"#, "`speed`: found 1e39, expected a number"),
+            (r#"{"speed": 1e39, "goal": [1, 2]}"#, "`speed`: found 1e+39, expected a number"),
             ("{", "frame.json: not JSON"),
         ];
         for (json, expected) in cases {
