@@ -1,2 +1,6 @@
-//! The command line.
-fn main() {}
+//! The command line; see [`host_sim::cli`].
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    host_sim::cli::main(std::env::args_os())
+}

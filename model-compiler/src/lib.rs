@@ -1,13 +1,16 @@
 //! Trained driving networks to int8 model images.
 #![forbid(unsafe_code)]
 
+pub mod artifact;
 pub mod calibrate;
 pub mod emit;
 pub mod error;
+pub mod frames;
 pub mod import;
 pub mod integer_reference;
 pub mod ir;
 pub mod memory_plan;
+pub mod metrics;
 pub mod pack;
 pub mod passes;
 pub mod qmodel;
