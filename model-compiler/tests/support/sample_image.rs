@@ -1,5 +1,7 @@
 //! A small image with every step kind, in-place pairs, scratch, shared memory and a known answer.
 
+#![allow(dead_code, reason = "each test uses its own subset")]
+
 use firmware::image::TensorRecord;
 use firmware::kernels::plan;
 use firmware::program::*;
