@@ -110,6 +110,11 @@ impl Checkpoint {
         &self.tensors
     }
 
+    /// Gives up the tensors, in file order.
+    pub fn into_tensors(self) -> Vec<NamedTensor> {
+        self.tensors
+    }
+
     /// The tensor of this name.
     pub fn get(&self, name: &str) -> Option<&NamedTensor> {
         self.index.get(name).map(|&at| &self.tensors[at])
