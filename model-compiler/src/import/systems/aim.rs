@@ -12,7 +12,7 @@ pub(super) fn recognize(tensors: &NamedTensors) -> bool {
 
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let resolution = b.options.resolution.unwrap_or(super::transfuser::DEFAULT_RESOLUTION);
-    let network = ResNet::detect(&b.tensors, "image_encoder.features");
+    let network = ResNet::detect(&b.tensors, "image_encoder.features", None);
     let rgb = b.rgb("image_encoder", resolution)?;
     let mut map = network.stem(b, rgb, 3)?;
     for stage in 1..=4 {

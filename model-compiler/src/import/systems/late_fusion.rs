@@ -6,14 +6,17 @@ use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::Op;
 
+const IMAGE: &str = "image_encoder.features";
+const LIDAR: &str = "lidar_encoder._model";
+
 pub(super) fn recognize(tensors: &NamedTensors) -> bool {
     has(tensors, "image_encoder.features.") && has(tensors, "lidar_encoder.")
 }
 
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let resolution = b.options.resolution.unwrap_or(super::transfuser::DEFAULT_RESOLUTION);
-    let image_network = ResNet::detect(&b.tensors, "image_encoder.features");
-    let lidar_network = ResNet::detect(&b.tensors, "lidar_encoder._model");
+    let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
+    let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);
     let rgb = b.rgb("image_encoder", resolution)?;
     let bev = b.bev("lidar_encoder", resolution, channels)?;

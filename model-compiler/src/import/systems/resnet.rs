@@ -18,16 +18,18 @@ pub(super) struct ResNet {
 }
 
 impl ResNet {
-    /// Sizes of the network under this prefix. What is missing altogether gets the published size.
-    pub(super) fn detect(tensors: &NamedTensors, prefix: &str) -> Self {
-        let stem_names = [format!("{prefix}.conv1."), format!("{prefix}.bn1.")];
-        let stem = common_length(tensors, &[&stem_names[0], &stem_names[1]], |_| true).unwrap_or(64);
-        let stage = |s: usize| format!("{prefix}.layer{}.", s + 1);
+    /// Sizes of the network under this prefix. What is missing altogether gets the size of the network under the
+    /// `sibling` prefix, or the published one.
+    pub(super) fn detect(tensors: &NamedTensors, prefix: &str, sibling: Option<&str>) -> Self {
+        let networks = || [Some(prefix), sibling].into_iter().flatten();
+        let stem = |p: &str| common_length(tensors, &[&format!("{p}.conv1."), &format!("{p}.bn1.")], |_| true);
+        let stage = |p: &str, s: usize| common_length(tensors, &[&format!("{p}.layer{}.", s + 1)], |_| true);
+        let blocks = |s: usize| indexed_count(tensors, &format!("{prefix}.layer{}.", s + 1)).max(1);
         Self {
             prefix: prefix.into(),
-            stem,
-            widths: std::array::from_fn(|s| common_length(tensors, &[&stage(s)], |_| true).unwrap_or(64 << s)),
-            blocks: std::array::from_fn(|s| indexed_count(tensors, &stage(s)).max(1)),
+            stem: networks().find_map(stem).unwrap_or(64),
+            widths: std::array::from_fn(|s| networks().find_map(|p| stage(p, s)).unwrap_or(64 << s)),
+            blocks: std::array::from_fn(blocks),
         }
     }
 

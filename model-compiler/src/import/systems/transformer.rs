@@ -2,7 +2,7 @@
 
 use super::builder::Builder;
 use super::detect::{common_length, indexed_count, most_common};
-use crate::error::{Error, ErrorCode, Result};
+use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::{LayerNorm, Op, Tokens, ValueId, Weights};
 use std::sync::Arc;
@@ -119,21 +119,11 @@ impl Transformer {
     ) -> Result<ValueId> {
         let p = prefix(self.scale);
         let mut branch = b.push(format!("{p}.ln_f.{side}"), Op::LayerNorm(norm), &[stream])?;
-        let factor = self.factor(b, map)?;
+        let size = b.graph.value(map).shape;
+        let factor = (size.height / self.grid.0, size.width / self.grid.1);
         if factor != (1, 1) {
             branch = b.push(format!("{p}.upsample.{side}"), Op::ResizeBilinear { factor }, &[branch])?;
         }
         b.push(format!("{p}.add.{side}"), Op::Add { relu: false }, &[branch, map])
-    }
-
-    fn factor(&self, b: &Builder<'_>, map: ValueId) -> Result<(u16, u16)> {
-        let map = b.graph.value(map).shape;
-        let (h, w) = self.grid;
-        if map.height % h == 0 && map.width % w == 0 {
-            return Ok((map.height / h, map.width / w));
-        }
-        let message = format!("a map of {}×{} is no whole multiple of {h}×{w} tokens", map.height, map.width);
-        Err(Error::new(ErrorCode::Unsupported, prefix(self.scale), message)
-            .with_help("height and width of the input must be multiples of 32 pixels"))
     }
 }

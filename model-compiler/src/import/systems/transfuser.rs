@@ -2,9 +2,12 @@
 
 use super::builder::Builder;
 use super::{has, head, resnet::ResNet, transformer::Transformer};
-use crate::error::Result;
+use crate::error::{Error, ErrorCode, Result};
 use crate::import::NamedTensors;
 use crate::ir::{InputKind, Op, Shape};
+
+const IMAGE: &str = "encoder.image_encoder.features";
+const LIDAR: &str = "encoder.lidar_encoder._model";
 
 /// Camera crop and LiDAR histogram as published, pixels.
 pub(super) const DEFAULT_RESOLUTION: (u16, u16) = (256, 256);
@@ -19,9 +22,9 @@ pub(super) fn recognize(tensors: &NamedTensors) -> bool {
 /// The ablations with fewer scales lack the first transformers: a scale without one is not fused.
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let resolution = resolution(b);
-    let grid = (resolution.0.div_ceil(TOTAL_STRIDE), resolution.1.div_ceil(TOTAL_STRIDE));
-    let image_network = ResNet::detect(&b.tensors, "encoder.image_encoder.features");
-    let lidar_network = ResNet::detect(&b.tensors, "encoder.lidar_encoder._model");
+    let grid = grid(resolution)?;
+    let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
+    let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);
     let scales = Transformer::detect_all(&b.tensors, &image_network.widths, grid);
 
@@ -44,17 +47,28 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     head::waypoints(b, features, 2)
 }
 
-/// Both maps are enlarged by 8, 4, 2, 1 from the token grid, so the grid is the size of the last stage's map and a
-/// square positional embedding tells the input size.
+/// Tokens of one map: both maps are enlarged from the token grid by 8, 4, 2, 1, so it is as large as the last stage's
+/// map.
+fn grid((height, width): (u16, u16)) -> Result<(u16, u16)> {
+    let (rows, columns) = (height / TOTAL_STRIDE, width / TOTAL_STRIDE);
+    if rows == 0 || columns == 0 || height % TOTAL_STRIDE != 0 || width % TOTAL_STRIDE != 0 {
+        let message = format!("an input of {height}×{width} pixels does not divide into tokens");
+        return Err(Error::new(ErrorCode::Usage, "", message)
+            .with_help(format!("height and width must be multiples of {TOTAL_STRIDE} pixels")));
+    }
+    Ok((rows, columns))
+}
+
+/// The input size that was asked for, or that a square positional embedding tells, or the published one.
 fn resolution(b: &Builder<'_>) -> (u16, u16) {
     b.options.resolution.unwrap_or_else(|| {
-        let side = Transformer::tokens(&b.tensors).map_or(0, |tokens| (tokens / 2).isqrt());
-        match (side, Transformer::tokens(&b.tensors)) {
-            (1..=64, Some(tokens)) if 2 * side * side == tokens => {
-                let pixels = side as u16 * TOTAL_STRIDE;
-                (pixels, pixels)
-            }
-            _ => DEFAULT_RESOLUTION,
+        let tokens = Transformer::tokens(&b.tensors).unwrap_or(0);
+        let side = (tokens / 2).isqrt();
+        if (1..=64).contains(&side) && 2 * side * side == tokens {
+            let pixels = side as u16 * TOTAL_STRIDE;
+            (pixels, pixels)
+        } else {
+            DEFAULT_RESOLUTION
         }
     })
 }
