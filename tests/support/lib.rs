@@ -2,3 +2,4 @@
 
 pub mod golden;
 pub mod build;
+pub mod torch_file;
