@@ -48,7 +48,8 @@ impl SaturationBounds {
 
     /// How many codes lie at a bound.
     pub fn count(&self, codes: &[i32]) -> u64 {
-        let at_bound = |&&code: &&i32| code == i32::from(self.max) || self.min.is_some_and(|min| code == i32::from(min));
+        let at_bound =
+            |&&code: &&i32| code == i32::from(self.max) || self.min.is_some_and(|min| code == i32::from(min));
         codes.iter().filter(at_bound).count() as u64
     }
 }
