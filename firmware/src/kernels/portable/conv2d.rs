@@ -1,4 +1,4 @@
-//! Portable convolution: windows gathered into scratch, then the [product](super::product) of a tile of them.
+//! Portable convolution: windows gathered into scratch, then the product of a tile of them with the weights.
 
 use super::axis::Axis;
 use super::codes::{Code, block, take, widen};
