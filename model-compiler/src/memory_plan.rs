@@ -7,8 +7,8 @@
 //! when its search is exhausted, or at a limit of search nodes. It never looks at a clock: same input, same plan.
 
 use crate::error::{Error, ErrorCode, Result};
-use crate::qmodel::QTensorId;
 use crate::qmodel::QModel;
+use crate::qmodel::QTensorId;
 use crate::schedule;
 use crate::target::Target;
 use needs::Needs;
@@ -136,13 +136,13 @@ pub fn plan(model: &QModel, target: &Target, options: &PlanOptions) -> Result<Me
 
 /// First and last position of a tensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct LiveRange {
-    first: u32,
-    last: u32,
+pub(crate) struct LiveRange {
+    pub first: u32,
+    pub last: u32,
 }
 
 /// An in-place choice per tensor: the tensor it takes over.
-type Pairs = Vec<Option<usize>>;
+pub(crate) type Pairs = Vec<Option<usize>>;
 
 /// Items with their meaning: the tensors of a chain, or the scratch of a position.
 struct Items {

@@ -27,7 +27,8 @@ pub(crate) struct Needs {
     pub overwritable: Vec<Vec<usize>>,
     /// Exact scratch bytes per step.
     pub scratch: Vec<u64>,
-    alignment: u64,
+    /// Of tensors, bytes.
+    pub alignment: u64,
 }
 
 impl Needs {
@@ -38,7 +39,8 @@ impl Needs {
         };
         check_dataflow(model)?;
         let alignment = u64::from(options.alignment);
-        let exact_bytes: Vec<u64> = (0..model.tensors.len()).map(|t| tensor_bytes(model, QTensorId(t as u32))).collect();
+        let exact_bytes: Vec<u64> =
+            (0..model.tensors.len()).map(|t| tensor_bytes(model, QTensorId(t as u32))).collect();
         let marked = |ports: &[crate::qmodel::Port]| {
             let mut marks = vec![false; model.tensors.len()];
             ports.iter().for_each(|p| marks[p.tensor.0 as usize] = true);

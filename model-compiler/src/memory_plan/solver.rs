@@ -88,7 +88,7 @@ pub(crate) fn pack(items: &[Item], node_limit: u64) -> Packing {
     Packing { offsets: best, peak, bound, peak_step, status, nodes }
 }
 
-/// Stages 2 and 3.
+/// Stages 2 to 4.
 fn improve(
     blocks: &[Block],
     sections: usize,
@@ -97,7 +97,9 @@ fn improve(
     best: &mut Vec<u64>,
     nodes: &mut u64,
 ) -> PlanStatus {
-    if let Some(offsets) = by_joins(blocks, sections, bound, node_limit / 2, nodes) {
+    let found = by_core(blocks, sections, bound, node_limit / 4, nodes)
+        .or_else(|| by_joins(blocks, sections, bound, node_limit / 2, nodes));
+    if let Some(offsets) = found {
         *best = offsets;
         return PlanStatus::Optimal;
     }
@@ -124,7 +126,27 @@ fn improve(
     }
 }
 
-/// Stage 2: the exact search over blocks that were joined where there is no slack.
+/// Stage 2: packs the blocks at the peak exactly, the others around them.
+fn by_core(blocks: &[Block], sections: usize, bound: u64, node_limit: u64, nodes: &mut u64) -> Option<Vec<u64>> {
+    let sums = section_sums(blocks, sections);
+    let mut in_core: Vec<bool> = blocks.iter().map(|b| sums[b.first..=b.last].contains(&bound)).collect();
+    while in_core.contains(&false) {
+        let (core, rest): (Vec<usize>, Vec<usize>) = (0..blocks.len()).partition(|&id| in_core[id]);
+        let shapes: Vec<Block> = core.iter().map(|&id| blocks[id].clone()).collect();
+        let Outcome::Found(bases) = skyline::search(&shapes, sections, bound, node_limit, nodes) else { return None };
+        let mut offsets = vec![0; blocks.len()];
+        core.iter().zip(bases).for_each(|(&id, base)| offsets[id] = base);
+        *nodes += rest.len() as u64;
+        let misfits = first_fit::place_around(blocks, core, rest, bound, &mut offsets);
+        if misfits.is_empty() {
+            return Some(offsets);
+        }
+        misfits.into_iter().for_each(|id| in_core[id] = true);
+    }
+    None
+}
+
+/// Stage 3: the exact search over blocks that were joined where there is no slack.
 fn by_joins(blocks: &[Block], sections: usize, bound: u64, node_limit: u64, nodes: &mut u64) -> Option<Vec<u64>> {
     for attempt in 0..JOIN_ATTEMPTS {
         let joined = joins::join(blocks, sections, bound, attempt);
@@ -142,6 +164,12 @@ fn by_joins(blocks: &[Block], sections: usize, bound: u64, node_limit: u64, node
         }
     }
     None
+}
+
+fn section_sums(blocks: &[Block], sections: usize) -> Vec<u64> {
+    let mut sums = vec![0; sections];
+    blocks.iter().for_each(|b| (b.first..=b.last).for_each(|t| sums[t] += b.height(t)));
+    sums
 }
 
 fn peak_of(blocks: &[Block], offsets: &[u64]) -> u64 {
