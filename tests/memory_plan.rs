@@ -395,6 +395,8 @@ fn same_input_same_plan() {
     assert_eq!(make(), make());
 }
 
+type Sabotage<'a> = &'a dyn Fn(&mut MemoryPlan);
+
 #[test]
 fn checker_catches_sabotage() {
     let model = transfuser(ElementType::I8);
@@ -403,7 +405,7 @@ fn checker_catches_sabotage() {
     let taker = id("image.layer1.0.conv2");
     let stem = id("lidar.stem");
     let conv = good.scratch.iter().position(Option::is_some).unwrap();
-    let cases: [(&str, &dyn Fn(&mut MemoryPlan)); 14] = [
+    let cases: [(&str, Sabotage<'_>); 14] = [
         ("overlap", &|p| p.tensors[stem].offset = p.tensors[id("bev")].offset),
         ("outside the arena", &|p| p.tensors[stem].offset = p.arena_bytes - 4),
         ("is not a multiple", &|p| p.tensors[stem].offset += 2),
@@ -429,7 +431,7 @@ fn checker_catches_sabotage() {
 
 #[test]
 fn an_operand_that_is_needed_later_is_not_overwritten() {
-    // x is added to itself once shifted, then read again: nothing may lie over it.
+    // `kept` is read twice by one step, and x is read again at the end: neither may be overwritten there.
     let mut b = Builder::new("sums", ElementType::I8);
     let shape = Shape::map(8, 8, 4);
     let x = b.input("x", shape, ElementType::I8);

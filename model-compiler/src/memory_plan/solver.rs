@@ -74,7 +74,7 @@ impl Block {
     }
 }
 
-/// Packs the items; all sizes are multiples of one unit (the alignment), so all offsets are.
+/// Packs the items; where all sizes are multiples of the alignment, all offsets are.
 pub(crate) fn pack(items: &[Item], node_limit: u64) -> Packing {
     let (bound, peak_step) = lower_bound(items);
     let (blocks, sections) = to_sections(items);
@@ -104,26 +104,17 @@ fn improve(
         return PlanStatus::Optimal;
     }
     let half = *nodes + node_limit.saturating_sub(*nodes) / 2;
-    let bound_reachable = match skyline::search(blocks, sections, bound, half, nodes) {
-        Outcome::Found(offsets) => {
-            *best = offsets;
-            return PlanStatus::Optimal;
-        }
-        Outcome::Exhausted => Some(false),
-        Outcome::Limit => None,
-    };
-    loop {
-        let peak = peak_of(blocks, best);
-        match skyline::search(blocks, sections, peak - 1, node_limit, nodes) {
+    if let Outcome::Found(offsets) = skyline::search(blocks, sections, bound, half, nodes) {
+        *best = offsets;
+    }
+    while peak_of(blocks, best) > bound {
+        match skyline::search(blocks, sections, peak_of(blocks, best) - 1, node_limit, nodes) {
             Outcome::Found(offsets) => *best = offsets,
             Outcome::Exhausted => return PlanStatus::OptimalBoundNotReachable,
             Outcome::Limit => return PlanStatus::NodeLimit,
         }
-        if peak_of(blocks, best) == bound {
-            debug_assert_ne!(bound_reachable, Some(false), "exhausted, yet reached");
-            return PlanStatus::Optimal;
-        }
     }
+    PlanStatus::Optimal
 }
 
 /// Stage 2: packs the blocks at the peak exactly, the others around them.
