@@ -5,12 +5,11 @@ use model_compiler::artifact;
 use model_compiler::emit::AlignedBytes;
 use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::frames::{self, Frame, FrameFormat};
-use model_compiler::import::ImportOptions;
-use model_compiler::ir::{Graph, InputKind};
-use model_compiler::passes::PassOptions;
-use model_compiler::pipeline;
+use model_compiler::ir::InputKind;
 use model_compiler::record::Record;
 use std::path::{Path, PathBuf};
+
+pub use crate::pending::{load_graph, record_path};
 
 /// A model image in memory, aligned as in flash.
 #[derive(Debug)]
@@ -59,7 +58,7 @@ impl ImageFile {
     /// # Errors
     /// The record is missing or damaged, or belongs to another image.
     pub fn record(&self, path: Option<&Path>) -> Result<Record> {
-        let path = path.map_or_else(|| pipeline::record_path(&self.path), Path::to_path_buf);
+        let path = path.map_or_else(|| record_path(&self.path), Path::to_path_buf);
         let record: Record = artifact::read(&path).map_err(|e| match e.code {
             ErrorCode::Io => e.with_help("the record is written beside the image; --record FILE names another place"),
             _ => e,
@@ -67,8 +66,10 @@ impl ImageFile {
         if record.image_sha256 != self.sha256() {
             let found = artifact::hex(&self.sha256()[..8]);
             let expected = artifact::hex(&record.image_sha256[..8]);
-            let message =
-                format!("the record belongs to another image: digest of {} is {found}…, expected {expected}…", self.path.display());
+            let message = format!(
+                "the record belongs to another image: digest of {} is {found}…, expected {expected}…",
+                self.path.display()
+            );
             let error = Error::new(ErrorCode::Malformed, path.display().to_string(), message);
             return Err(error.with_help("compile again, or keep OUT.img and OUT.record of one build together"));
         }
@@ -100,14 +101,6 @@ pub fn file_sha256(path: &Path) -> Result<String> {
     Ok(artifact::hex(&artifact::sha256(&read(path)?)))
 }
 
-/// The optimized float graph of a checkpoint.
-///
-/// # Errors
-/// The file is no checkpoint of a known system.
-pub fn load_graph(path: &Path) -> Result<Graph> {
-    pipeline::load_graph(path, &ImportOptions::default(), &PassOptions::default())
-}
-
 /// Where frames come from.
 #[derive(Clone, Debug, PartialEq, Eq, clap::Args)]
 #[group(required = true, multiple = false)]
@@ -131,7 +124,9 @@ impl FrameSource {
             (Some(path), _) if path.is_file() => usage(path, "--frames takes a directory; a file goes to --inputs"),
             (None, Some(path)) if path.is_dir() => usage(path, "--inputs takes a file; a directory goes to --frames"),
             (Some(path), _) | (None, Some(path)) => frames::load(path, format),
-            (None, None) => Err(Error::new(ErrorCode::Usage, "", "no frames given").with_help("--frames DIR or --inputs FILE")),
+            (None, None) => {
+                Err(Error::new(ErrorCode::Usage, "", "no frames given").with_help("--frames DIR or --inputs FILE"))
+            }
         }
     }
 }

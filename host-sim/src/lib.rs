@@ -18,8 +18,12 @@ pub mod cli;
 pub mod codes;
 pub mod compare;
 pub mod files;
+mod pending;
 pub mod report;
 pub mod run;
 pub mod statistics;
 pub mod trace;
 pub mod verify;
+
+#[cfg(test)]
+mod testing;
