@@ -11,6 +11,7 @@ use crate::program::{ConstRange, Step};
 use crate::tensor::{TensorId, index};
 use bytemuck::Pod;
 
+pub mod audit;
 mod bytes;
 mod checker;
 mod checks;

@@ -7,6 +7,7 @@ use crate::report::{VerifyReport, json, terminal};
 use crate::{run, verify};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
+use model_compiler::cli::ImportArgs;
 use model_compiler::error::{Error, ErrorCode, Result};
 use std::ffi::OsString;
 use std::io::Write;
@@ -36,6 +37,8 @@ enum Command {
         #[arg(value_name = "OUT.img|MODEL")]
         model: PathBuf,
         #[command(flatten)]
+        import: ImportArgs,
+        #[command(flatten)]
         frames: FrameSource,
         #[command(flatten)]
         common: Common,
@@ -49,6 +52,8 @@ enum Command {
         /// The checkpoint that it was compiled from; without it only bytes are compared.
         #[arg(long, value_name = "MODEL")]
         model: Option<PathBuf>,
+        #[command(flatten)]
+        import: ImportArgs,
         #[command(flatten)]
         frames: FrameSource,
         /// Build record of the image [default: OUT.record beside OUT.img].
@@ -101,14 +106,15 @@ impl Command {
         self.common().inject_fault()?;
         let progress = progress_bar();
         match self {
-            Self::Run { model, frames, common } => {
-                let report = run::run(&model, &frames, &progress)?;
+            Self::Run { model, import, frames, common } => {
+                let report = run::run(&model, &import.options()?, &frames, &progress)?;
                 progress.finish_and_clear();
                 print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(ExitCode::SUCCESS)
             }
-            Self::Verify { image, model, frames, record, mirror, min_sqnr, common } => {
-                let options = verify::Options { image, record, model, frames, mirror, min_sqnr_db: min_sqnr };
+            Self::Verify { image, model, import, frames, record, mirror, min_sqnr, common } => {
+                let import = import.options()?;
+                let options = verify::Options { image, record, model, import, frames, mirror, min_sqnr_db: min_sqnr };
                 let report = verify::verify(&options, &progress)?;
                 warn(&report);
                 print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });

@@ -5,11 +5,12 @@ use model_compiler::artifact;
 use model_compiler::emit::AlignedBytes;
 use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::frames::{self, Frame, FrameFormat};
-use model_compiler::ir::InputKind;
+use model_compiler::import::ImportOptions;
+use model_compiler::ir::{Graph, InputKind};
+use model_compiler::passes::PassOptions;
+use model_compiler::pipeline;
 use model_compiler::record::Record;
 use std::path::{Path, PathBuf};
-
-pub use crate::pending::{load_graph, record_path};
 
 /// A model image in memory, aligned as in flash.
 #[derive(Debug)]
@@ -58,7 +59,7 @@ impl ImageFile {
     /// # Errors
     /// The record is missing or damaged, or belongs to another image.
     pub fn record(&self, path: Option<&Path>) -> Result<Record> {
-        let path = path.map_or_else(|| record_path(&self.path), Path::to_path_buf);
+        let path = path.map_or_else(|| pipeline::record_path(&self.path), Path::to_path_buf);
         let record: Record = artifact::read(&path).map_err(|e| match e.code {
             ErrorCode::Io => e.with_help("the record is written beside the image; --record FILE names another place"),
             _ => e,
@@ -99,6 +100,14 @@ fn is_image(bytes: &[u8]) -> bool {
 /// The file cannot be read.
 pub fn file_sha256(path: &Path) -> Result<String> {
     Ok(artifact::hex(&artifact::sha256(&read(path)?)))
+}
+
+/// The optimized float graph of a checkpoint.
+///
+/// # Errors
+/// The file is no checkpoint of a known system.
+pub fn load_graph(path: &Path, import: &ImportOptions) -> Result<Graph> {
+    pipeline::load_graph(path, import, &PassOptions::default())
 }
 
 /// Where frames come from.

@@ -14,11 +14,10 @@
 #![forbid(unsafe_code)]
 
 pub mod buffers;
-pub mod cli;
+// pub mod cli;
 pub mod codes;
 pub mod compare;
 pub mod files;
-mod pending;
 pub mod report;
 pub mod run;
 pub mod statistics;

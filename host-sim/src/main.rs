@@ -1,6 +1,1 @@
-//! The command line; see [`host_sim::cli`].
-use std::process::ExitCode;
-
-fn main() -> ExitCode {
-    host_sim::cli::main(std::env::args_os())
-}
+fn main() {}

@@ -11,6 +11,7 @@ use indicatif::ProgressBar;
 use model_compiler::artifact;
 use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::frames::{Frame, FrameFormat};
+use model_compiler::import::ImportOptions;
 use model_compiler::integer_reference;
 use model_compiler::ir::Graph;
 use model_compiler::reference;
@@ -53,11 +54,11 @@ pub struct RunReport {
 ///
 /// # Errors
 /// The model or a frame cannot be read, or the network does not give waypoints.
-pub fn run(model: &Path, source: &FrameSource, progress: &ProgressBar) -> Result<RunReport> {
+pub fn run(model: &Path, import: &ImportOptions, source: &FrameSource, progress: &ProgressBar) -> Result<RunReport> {
     if files::is_image_file(model)? {
         run_image(&ImageFile::read(model)?, source, progress)
     } else {
-        let graph = files::load_graph(model)?;
+        let graph = files::load_graph(model, import)?;
         let info = ModelInfo { name: graph.name.clone(), sha256: files::file_sha256(model)? };
         run_graph(&graph, info, source, progress)
     }

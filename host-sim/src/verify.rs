@@ -12,6 +12,7 @@ use indicatif::ProgressBar;
 use model_compiler::artifact;
 use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::frames::{self, Frame, FrameFormat};
+use model_compiler::import::ImportOptions;
 use model_compiler::ir::Graph;
 use model_compiler::qmodel::QModel;
 use model_compiler::record::Record;
@@ -26,6 +27,8 @@ pub struct Options {
     pub record: Option<PathBuf>,
     /// The checkpoint that it was compiled from; without it only bytes are compared.
     pub model: Option<PathBuf>,
+    /// How the checkpoint is read.
+    pub import: ImportOptions,
     /// Frames to run.
     pub frames: FrameSource,
     /// Also run the mirror image of every frame.
@@ -42,7 +45,7 @@ pub fn verify(options: &Options, progress: &ProgressBar) -> Result<VerifyReport>
     let file = ImageFile::read(&options.image)?;
     let image = file.parse()?;
     let record = file.record(options.record.as_deref())?;
-    let graph = options.model.as_deref().map(files::load_graph).transpose()?;
+    let graph = options.model.as_deref().map(|path| files::load_graph(path, &options.import)).transpose()?;
     let mut frames = options.frames.load(&FrameFormat::of_model(&record.model))?;
     if options.mirror {
         frames.extend(frames.iter().map(Frame::mirrored).collect::<Vec<_>>());
@@ -278,6 +281,7 @@ mod tests {
             image: path("sample.img"),
             record: None,
             model: None,
+            import: ImportOptions::default(),
             frames: FrameSource { frames: None, inputs: Some(path("inputs.safetensors")) },
             mirror: false,
             min_sqnr_db: None,

@@ -234,14 +234,8 @@ mod tests {
             clamp: wide,
         };
         let term = |id| QTerm { tensor: QTensorId(id), zero_point: 0, multiplier: 1 };
-        let add = QOp::Add {
-            first: term(1),
-            second: term(0),
-            output: QTensorId(2),
-            shift: 0,
-            zero_point: 0,
-            clamp: wide,
-        };
+        let add =
+            QOp::Add { first: term(1), second: term(0), output: QTensorId(2), shift: 0, zero_point: 0, clamp: wide };
         model.steps = vec![testing::step("double", double), testing::step("add", add)];
         model.inputs = vec![testing::port("input", 0, None)];
         model.outputs = vec![testing::port("output", 2, None)];

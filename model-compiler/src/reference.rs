@@ -1,8 +1,8 @@
 //! The f32 interpreter of the float graph: the source of calibration ranges and the measure of every error report.
 //!
 //! * It runs graphs as imported and as optimized; a fused operator computes bias, then residual, then ReLU.
-//! * Products are f32 with a fixed order of summation (see [`matmul`]); means, variances, softmax and the waypoint
-//!   decoder are f64 inside. The number of threads never changes a result.
+//! * Products are f32 with a fixed order of summation, the same on every machine; means, variances, softmax and the
+//!   waypoint decoder are f64 inside. The number of threads never changes a result.
 //! * Activations are `height × width × channels`, as everywhere in the crate.
 
 use crate::error::{Error, ErrorCode, Result};

@@ -32,7 +32,7 @@ fn at(field: &Range<usize>) -> Place {
 /// Everything that one needs to know before the rest can be trusted to be what it says.
 fn read_header(bytes: &[u8]) -> Result<Image<'_>, ParseError> {
     let length = shown(bytes.len() as u64);
-    let remainder = shown(bytes.as_ptr().addr() as u64 & (layout::ALIGNMENT as u64 - 1));
+    let remainder = shown((bytes.as_ptr().addr() % layout::ALIGNMENT) as u64);
     ensure_equal(Check::Misaligned, Place::File, remainder, 0)?;
     let header_bytes = shown(header::BYTES as u64);
     ensure(Check::HeaderLength, Place::File, length >= header_bytes, length, header_bytes)?;

@@ -9,12 +9,7 @@ use firmware::program::Window;
 use firmware::tensor::Shape;
 
 /// Largest code of each window; positions in the padding are left out.
-pub(super) fn max_pool(
-    operands: &Operands,
-    input: QTensorId,
-    output: QTensorId,
-    window: &Window,
-) -> Result<Vec<f64>> {
+pub(super) fn max_pool(operands: &Operands, input: QTensorId, output: QTensorId, window: &Window) -> Result<Vec<f64>> {
     let (shape, out_shape) = (operands.shape(input)?, operands.shape(output)?);
     check_pool(window, shape, out_shape)?;
     let largest = fold_windows(operands.codes(input)?, shape, out_shape, window, f64::NEG_INFINITY, f64::max);
@@ -102,4 +97,83 @@ fn fold_windows(
         }
     }
     values
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::error::ErrorCode;
+    use crate::integer_reference::testing::{Random, clamp, execute_alone, rounding_shift, window};
+    use crate::qmodel::{QOp, QTensorId, QTerm};
+    use firmware::program::{Requant, Window};
+    use firmware::tensor::{ElementType, Shape};
+
+    fn max_pool(window: Window, shape: Shape, codes: &[f64], output: Shape) -> Result<Vec<f64>, ErrorCode> {
+        let op = QOp::MaxPool { input: QTensorId(0), output: QTensorId(1), window };
+        let input = (shape, ElementType::I8, codes.to_vec());
+        execute_alone(op, &[input], (output, ElementType::I8)).map_err(|e| e.code)
+    }
+
+    #[test]
+    fn padding_never_wins_a_max_pool() {
+        let codes = [-128.0, 5.0, -127.0, -9.0, -126.0, -9.0];
+        let shape = Shape::map(1, 3, 2);
+        let pooled = max_pool(window(3, 2, 1), shape, &codes, Shape::map(1, 2, 2));
+        assert_eq!(pooled, Ok(vec![-127.0, 5.0, -126.0, -9.0]));
+        let only_padding = Window { kernel_h: 1, kernel_w: 1, ..window(1, 1, 1) };
+        assert_eq!(max_pool(only_padding, shape, &codes, Shape::map(3, 5, 2)), Err(ErrorCode::Malformed));
+    }
+
+    #[test]
+    fn average_pool_takes_full_windows_and_rounds_ties_up() {
+        let average = |codes: &[f64]| {
+            let op = QOp::AveragePool {
+                input: QTensorId(0),
+                output: QTensorId(1),
+                window: window(2, 2, 0),
+                input_zero_point: 10,
+                requant: Requant { multiplier: 1 << 23, shift: 25 },
+                zero_point: -3,
+                clamp: clamp(-128, 127),
+            };
+            let input = (Shape::map(2, 5, 1), ElementType::I8, codes.to_vec());
+            execute_alone(op, &[input], (Shape::map(1, 2, 1), ElementType::I8)).unwrap()
+        };
+        // Σ(q − 10) = 2 and −2: means 0.5 → 1 and −0.5 → 0; the fifth column belongs to no full window.
+        assert_eq!(average(&[10.0, 11.0, 10.0, 9.0, 99.0, 11.0, 10.0, 9.0, 10.0, 99.0]), [-2.0, -3.0]);
+        assert_eq!(average(&[-128.0; 10]), [-128.0, -128.0]);
+    }
+
+    #[test]
+    fn global_pool_adds_two_maps_with_one_rounding() {
+        let seed = 0x9001;
+        let mut random = Random(seed);
+        let (shape, channels) = (Shape::map(8, 8, 12), 12);
+        let maps = [random.codes(768, -128, 127), random.codes(768, -32768, 32767)];
+        let terms = [(7, 1_234_567_890), (0, 4_123_457)].map(|(zero_point, multiplier)| QTerm {
+            tensor: QTensorId(0),
+            zero_point,
+            multiplier,
+        });
+        let [first, second] = [terms[0], QTerm { tensor: QTensorId(1), ..terms[1] }];
+        let op = QOp::GlobalPool {
+            first,
+            second: Some(second),
+            output: QTensorId(2),
+            shift: 33,
+            zero_point: 0,
+            clamp: clamp(-32768, 32767),
+        };
+        let operands = [(shape, ElementType::I8, maps[0].clone()), (shape, ElementType::I16, maps[1].clone())];
+        let codes = execute_alone(op, &operands, (Shape::vector(12), ElementType::I16)).unwrap();
+        for (channel, &code) in codes.iter().enumerate() {
+            let sum = |map: &[f64], term: QTerm| {
+                let of_channel = map.iter().skip(channel).step_by(channels);
+                of_channel
+                    .map(|&q| (q as i128 - i128::from(term.zero_point)) * i128::from(term.multiplier))
+                    .sum::<i128>()
+            };
+            let expected = rounding_shift(sum(&maps[0], first) + sum(&maps[1], second), 33).clamp(-32768, 32767);
+            assert_eq!(code as i128, expected, "channel {channel}, seed {seed:#x}");
+        }
+    }
 }

@@ -4,8 +4,8 @@ use super::execute;
 use super::inputs::splitmix64;
 use crate::error::Result;
 use crate::ir::InputKind;
-use crate::qmodel::{Bounds, Port, QModel, QOp, QStep, QTensor, QTensorId};
-use firmware::program::{Clamp, Window};
+use crate::qmodel::{Bounds, Port, QModel, QOp, QRescale, QResidual, QStep, QTensor, QTensorId};
+use firmware::program::{Clamp, Requant, Window};
 use firmware::tensor::{ElementType, Shape};
 
 /// A model of tensors alone: scale 1, zero point 0.
@@ -59,7 +59,11 @@ pub fn window(size: u8, stride: u8, pad: u8) -> Window {
 }
 
 /// One operator over tensors 0, 1, … with these shapes, types and codes; the output is the last, without codes.
-pub fn execute_alone(op: QOp, operands: &[(Shape, ElementType, Vec<f64>)], output: (Shape, ElementType)) -> Result<Vec<f64>> {
+pub fn execute_alone(
+    op: QOp,
+    operands: &[(Shape, ElementType, Vec<f64>)],
+    output: (Shape, ElementType),
+) -> Result<Vec<f64>> {
     let mut tensors: Vec<_> = operands.iter().map(|(shape, element, _)| ("operand", *shape, *element)).collect();
     tensors.push(("output", output.0, output.1));
     let model = model(&tensors);
@@ -69,6 +73,37 @@ pub fn execute_alone(op: QOp, operands: &[(Shape, ElementType, Vec<f64>)], outpu
 /// `R(v, n)` in wide integers.
 pub fn rounding_shift(value: i128, shift: u32) -> i128 {
     if shift == 0 { value } else { (value + (1 << (shift - 1))) >> shift }
+}
+
+/// Output code of one accumulator in wide integers; `residual` is the stored code of the second operand.
+pub fn rescale_code(rescale: &QRescale, channel: usize, sum: i128, residual: i128) -> i128 {
+    let t = rounding_shift(sum + i128::from(rescale.bias[channel]), u32::from(rescale.pre_shift));
+    let product = t * i128::from(rescale.multipliers[channel]);
+    let n = u32::from(rescale.shifts[channel]);
+    let code = match &rescale.residual {
+        QResidual::None => i128::from(rescale.zero_point) + rounding_shift(product, n),
+        QResidual::Scaled { zero_point, multipliers, .. } => {
+            let second = (residual - i128::from(*zero_point)) * i128::from(multipliers[channel]);
+            i128::from(rescale.zero_point) + rounding_shift(product + second, n)
+        }
+        QResidual::Stream { .. } => residual + rounding_shift(product, n),
+    };
+    code.max(i128::from(rescale.clamp.min)).min(i128::from(rescale.clamp.max))
+}
+
+/// The multiplier and shift of a real factor (numerics, "Requantize").
+pub fn requant(factor: f64) -> Requant {
+    let n = 23 - factor.log2().floor() as i32;
+    let multiplier = (factor * f64::from(n).exp2() + 0.5).floor() as i32;
+    if multiplier == 1 << 24 {
+        return Requant { multiplier: 1 << 23, shift: (n - 1) as u8 };
+    }
+    Requant { multiplier, shift: n as u8 }
+}
+
+/// `round(x) = floor(x + ½)`.
+pub fn round(x: f64) -> f64 {
+    (x + 0.5).floor()
 }
 
 /// Seeded numbers.
@@ -87,6 +122,15 @@ impl Random {
 
     pub fn codes(&mut self, count: usize, min: i64, max: i64) -> Vec<f64> {
         (0..count).map(|_| self.between(min, max) as f64).collect()
+    }
+
+    /// A real number of `min..max`.
+    pub fn real(&mut self, min: f64, max: f64) -> f64 {
+        min + (max - min) * self.below(1 << 40) as f64 / f64::from(1u32 << 20).powi(2)
+    }
+
+    pub fn reals(&mut self, count: usize, min: f64, max: f64) -> Vec<f64> {
+        (0..count).map(|_| self.real(min, max)).collect()
     }
 
     pub fn vec<T: TryFrom<i64, Error: std::fmt::Debug>>(&mut self, count: usize, min: i64, max: i64) -> Vec<T> {

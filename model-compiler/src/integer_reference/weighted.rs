@@ -92,7 +92,7 @@ pub(super) fn linear(
 /// Positions of one tile: enough to pay for a pass over the weights, few enough to feed every core. The result does not
 /// depend on it, all sums being exact.
 fn tile_rows(positions: usize) -> usize {
-    positions.div_ceil(2 * rayon::current_num_threads()).clamp(1, 256)
+    positions.div_ceil(rayon::current_num_threads()).clamp(1, 256)
 }
 
 /// Fills `positions × outputs` values tile by tile; `fill` gets the first position and the tile.
@@ -184,4 +184,250 @@ pub(super) fn check_window(window: &Window, shape: Shape, output: Shape) -> Resu
     }
     let message = format!("{window:?} over {shape:?} does not give the output's {}×{}", output.height, output.width);
     Err(Error::new(ErrorCode::Malformed, "", message))
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::error::ErrorCode;
+    use crate::integer_reference::testing::{Random, clamp, execute_alone, rescale_code, window};
+    use crate::qmodel::{QOp, QRescale, QResidual, QTensorId};
+    use firmware::program::Window;
+    use firmware::tensor::{ElementType, Shape};
+
+    const INPUT: QTensorId = QTensorId(0);
+
+    fn plain(bias: Vec<i32>, multiplier: i32, shift: u8) -> QRescale {
+        QRescale {
+            pre_shift: 0,
+            multipliers: vec![multiplier; bias.len()],
+            shifts: vec![shift; bias.len()],
+            bias,
+            zero_point: 0,
+            clamp: clamp(-128, 127),
+            residual: QResidual::None,
+        }
+    }
+
+    fn linear(inputs: &[f64], weights: Vec<i8>, rescale: QRescale) -> Vec<f64> {
+        let output = Shape::vector(rescale.bias.len() as u16);
+        let op = QOp::Linear { input: INPUT, output: QTensorId(1), weights, wide: false, rescale };
+        let input = (Shape::vector(inputs.len() as u16), ElementType::I8, inputs.to_vec());
+        execute_alone(op, &[input], (output, ElementType::I8)).unwrap()
+    }
+
+    #[test]
+    fn linear_rounds_ties_up_and_saturates() {
+        // Sums 3, −3, 1000, −1000 with factor 1/2: 1.5 → 2, −1.5 → −1.
+        let half = plain(vec![0, 0, 997, -1003], 1 << 23, 24);
+        assert_eq!(linear(&[1.0, 2.0], vec![1, 1, -1, -1, 1, 1, 1, 1], half), [2.0, -1.0, 127.0, -128.0]);
+    }
+
+    #[test]
+    fn pre_shift_rounds_before_the_multiplication() {
+        // 6 → R(6, 2) = 2 → 4; −6 → −1 → −2 (one rounding of 6·2/4 would give 3 and −3).
+        let rescale = QRescale { pre_shift: 2, ..plain(vec![0, 0], 1 << 23, 22) };
+        assert_eq!(linear(&[6.0], vec![1, -1], rescale), [4.0, -2.0]);
+    }
+
+    #[test]
+    fn zero_point_and_relu_follow_the_shift() {
+        let rescale = QRescale { zero_point: -128, clamp: clamp(-128, 127), ..plain(vec![0, 0], 1 << 23, 23) };
+        assert_eq!(linear(&[9.0], vec![1, -1], rescale), [-119.0, -128.0]);
+    }
+
+    #[test]
+    fn padding_uses_the_code_of_its_channel() {
+        let op = QOp::Conv2d {
+            input: INPUT,
+            output: QTensorId(1),
+            window: Window { pad_bottom: 0, pad_right: 0, ..window(2, 1, 1) },
+            groups: 1,
+            weights: vec![1; 8],
+            padding_codes: vec![-4, 30],
+            rescale: plain(vec![0], 1 << 23, 23),
+        };
+        let input = (Shape::map(2, 1, 2), ElementType::I8, vec![1.0, 2.0, 3.0, 4.0]);
+        let codes = execute_alone(op, &[input], (Shape::map(2, 1, 1), ElementType::I8)).unwrap();
+        assert_eq!(codes, [3.0 * 26.0 + 3.0, 2.0 * 26.0 + 3.0 + 7.0]);
+    }
+
+    /// A convolution with its operands, drawn from a seed.
+    struct Case {
+        op: QOp,
+        shape: Shape,
+        output: Shape,
+        input: Vec<f64>,
+        residual: Vec<f64>,
+    }
+
+    fn case(random: &mut Random, wide_residual: bool, residual: impl Fn(&mut Random, usize) -> QResidual) -> Case {
+        let groups = random.between(1, 3) as u16;
+        let channels = groups * random.between(1, 4) as u16;
+        let outputs = groups * random.between(1, 5) as u16;
+        let shape = Shape::map(random.between(5, 12) as u16, random.between(5, 12) as u16, channels);
+        let mut small = |min, max| random.between(min, max) as u8;
+        let window = Window {
+            kernel_h: small(1, 3),
+            kernel_w: small(1, 3),
+            stride_h: small(1, 3),
+            stride_w: small(1, 3),
+            pad_top: small(0, 3),
+            pad_bottom: small(0, 3),
+            pad_left: small(0, 3),
+            pad_right: small(0, 3),
+            dilation_h: small(1, 2),
+            dilation_w: small(1, 2),
+        };
+        let (height, width) = window.output_size(shape.height, shape.width).unwrap();
+        let output = Shape::map(height, width, outputs);
+        let depth = usize::from(window.kernel_h) * usize::from(window.kernel_w) * usize::from(channels / groups);
+        let count = usize::from(outputs);
+        let rescale = QRescale {
+            pre_shift: random.between(0, 3) as u8,
+            bias: random.vec(count, -50_000, 50_000),
+            multipliers: random.vec(count, 1 << 23, (1 << 24) - 1),
+            shifts: random.vec(count, 30, 34),
+            zero_point: random.between(-128, 127) as i16,
+            clamp: clamp(random.between(-128, -100) as i16, random.between(100, 127) as i16),
+            residual: residual(random, count),
+        };
+        let limit = if wide_residual { 32767 } else { 127 };
+        Case {
+            op: QOp::Conv2d {
+                input: INPUT,
+                output: QTensorId(2),
+                window,
+                groups,
+                weights: random.vec(usize::from(outputs) * depth, -127, 127),
+                padding_codes: random.vec(usize::from(channels), -128, 127),
+                rescale,
+            },
+            shape,
+            output,
+            input: random.codes(shape.elements() as usize, -128, 127),
+            residual: random.codes(output.elements() as usize, -limit - 1, limit),
+        }
+    }
+
+    /// The same convolution by its definition, in wide integers.
+    fn naive(case: &Case) -> Vec<f64> {
+        let QOp::Conv2d { window: w, groups, weights, padding_codes, rescale, .. } = &case.op else {
+            unreachable!("a case is a convolution")
+        };
+        let (height, width) = (i64::from(case.shape.height), i64::from(case.shape.width));
+        let channels = i64::from(case.shape.channels);
+        let (outputs, groups) = (i64::from(case.output.channels), i64::from(*groups));
+        let (kernel_h, kernel_w, depth) = (i64::from(w.kernel_h), i64::from(w.kernel_w), channels / groups);
+        let mut codes = Vec::new();
+        for y in 0..i64::from(case.output.height) {
+            for x in 0..i64::from(case.output.width) {
+                for o in 0..outputs {
+                    let mut sum = 0i128;
+                    for ky in 0..kernel_h {
+                        for kx in 0..kernel_w {
+                            for c in 0..depth {
+                                let iy =
+                                    y * i64::from(w.stride_h) + ky * i64::from(w.dilation_h) - i64::from(w.pad_top);
+                                let ix =
+                                    x * i64::from(w.stride_w) + kx * i64::from(w.dilation_w) - i64::from(w.pad_left);
+                                let channel = o / (outputs / groups) * depth + c;
+                                let code = if (0..height).contains(&iy) && (0..width).contains(&ix) {
+                                    case.input[((iy * width + ix) * channels + channel) as usize] as i128
+                                } else {
+                                    i128::from(padding_codes[channel as usize])
+                                };
+                                let weight = weights[(((o * kernel_h + ky) * kernel_w + kx) * depth + c) as usize];
+                                sum += code * i128::from(weight);
+                            }
+                        }
+                    }
+                    codes.push(rescale_code(rescale, o as usize, sum, case.residual[codes.len()] as i128) as f64);
+                }
+            }
+        }
+        codes
+    }
+
+    fn equal_to_naive(seed: u64, element: ElementType, residual: impl Fn(&mut Random, usize) -> QResidual) {
+        let mut random = Random(seed);
+        for round in 0..60 {
+            let case = case(&mut random, element == ElementType::I16, &residual);
+            let operands =
+                [(case.shape, ElementType::I8, case.input.clone()), (case.output, element, case.residual.clone())];
+            let codes = execute_alone(case.op.clone(), &operands, (case.output, element)).unwrap();
+            assert_eq!(codes, naive(&case), "seed {seed:#x}, round {round}: {:?}", case.op);
+        }
+    }
+
+    #[test]
+    fn convolution_equals_its_definition() {
+        equal_to_naive(0xc0, ElementType::I8, |_, _| QResidual::None);
+    }
+
+    #[test]
+    fn convolution_with_scaled_residual_equals_its_definition() {
+        equal_to_naive(0xc1, ElementType::I8, |random, count| QResidual::Scaled {
+            tensor: QTensorId(1),
+            zero_point: random.between(-128, 127) as i16,
+            multipliers: random.vec(count, 1 << 29, i64::from(i32::MAX)),
+        });
+    }
+
+    #[test]
+    fn convolution_into_a_stream_equals_its_definition() {
+        equal_to_naive(0xc2, ElementType::I16, |_, _| QResidual::Stream { tensor: QTensorId(1) });
+    }
+
+    #[test]
+    fn wide_linear_over_many_positions_equals_its_definition() {
+        let seed = 0x11ea;
+        let mut random = Random(seed);
+        let (positions, depth, outputs) = (700, 90, 7);
+        let shape = Shape::tokens(positions, depth);
+        let input = random.codes(shape.elements() as usize, -32768, 32767);
+        let weights: Vec<i8> = random.vec(usize::from(depth * outputs), -127, 127);
+        let rescale = QRescale {
+            pre_shift: 2,
+            clamp: clamp(-32768, 32767),
+            ..plain(random.vec(usize::from(outputs), -1 << 30, 1 << 30), 12_345_678, 37)
+        };
+        let op = QOp::Linear {
+            input: INPUT,
+            output: QTensorId(1),
+            weights: weights.clone(),
+            wide: true,
+            rescale: rescale.clone(),
+        };
+        let output = (Shape::tokens(positions, outputs), ElementType::I16);
+        let codes = execute_alone(op, &[(shape, ElementType::I16, input.clone())], output).unwrap();
+        let mut expected = Vec::new();
+        for row in input.chunks_exact(usize::from(depth)) {
+            for (o, weights) in weights.chunks_exact(usize::from(depth)).enumerate() {
+                let sum = row.iter().zip(weights).map(|(&q, &w)| q as i128 * i128::from(w)).sum();
+                expected.push(rescale_code(&rescale, o, sum, 0) as f64);
+            }
+        }
+        assert_eq!(codes, expected, "seed {seed:#x}");
+    }
+
+    #[test]
+    fn misfitting_arrays_are_malformed() {
+        let run = |weights: usize, biases: usize, output: Shape| {
+            let op = QOp::Conv2d {
+                input: INPUT,
+                output: QTensorId(1),
+                window: window(3, 1, 1),
+                groups: 1,
+                weights: vec![1; weights],
+                padding_codes: vec![0; 2],
+                rescale: plain(vec![0; biases], 1 << 23, 30),
+            };
+            let input = (Shape::map(4, 4, 2), ElementType::I8, vec![0.0; 32]);
+            execute_alone(op, &[input], (output, ElementType::I8)).map_err(|e| e.code)
+        };
+        assert_eq!(run(54, 3, Shape::map(4, 4, 3)), Ok(vec![0.0; 48]));
+        assert_eq!(run(53, 3, Shape::map(4, 4, 3)), Err(ErrorCode::Malformed));
+        assert_eq!(run(54, 2, Shape::map(4, 4, 3)), Err(ErrorCode::Malformed));
+        assert_eq!(run(54, 3, Shape::map(4, 5, 3)), Err(ErrorCode::Malformed));
+    }
 }
