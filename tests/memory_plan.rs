@@ -37,7 +37,15 @@ impl Builder {
 
     fn tensor(&mut self, name: &str, shape: Shape, element: ElementType) -> QTensorId {
         let (name, value) = (name.to_string(), name.to_string());
-        self.model.tensors.push(QTensor { name, value, shape, element, scale: 1.0, zero_point: 0, saturation_ppm: None });
+        self.model.tensors.push(QTensor {
+            name,
+            value,
+            shape,
+            element,
+            scale: 1.0,
+            zero_point: 0,
+            saturation_ppm: None,
+        });
         QTensorId(self.model.tensors.len() as u32 - 1)
     }
 
@@ -69,11 +77,8 @@ impl Builder {
         let window = window(kernel, stride);
         let from = self.shape(input);
         let (height, width) = window.output_size(from.height, from.width).unwrap();
-        let residual = residual.map_or(QResidual::None, |tensor| QResidual::Scaled {
-            tensor,
-            zero_point: 0,
-            multipliers: vec![],
-        });
+        let residual =
+            residual.map_or(QResidual::None, |tensor| QResidual::Scaled { tensor, zero_point: 0, multipliers: vec![] });
         self.step(name, Shape::map(height, width, channels), element, |output| QOp::Conv2d {
             input,
             output,
@@ -240,15 +245,7 @@ fn window(kernel: u8, stride: u8) -> Window {
 }
 
 fn rescale(residual: QResidual) -> QRescale {
-    QRescale {
-        pre_shift: 0,
-        bias: vec![],
-        multipliers: vec![],
-        shifts: vec![],
-        zero_point: 0,
-        clamp: CLAMP,
-        residual,
-    }
+    QRescale { pre_shift: 0, bias: vec![], multipliers: vec![], shifts: vec![], zero_point: 0, clamp: CLAMP, residual }
 }
 
 fn term(tensor: QTensorId) -> QTerm {
@@ -264,7 +261,8 @@ fn transfuser(skip: ElementType) -> QModel {
     let goal = b.input("goal", Shape::vector(2), ElementType::I32);
     let stems = [("image.stem", rgb), ("lidar.stem", bev)].map(|(name, x)| b.conv(name, x, (64, 7, 2), skip, None));
     let mut maps = [("image.pool", stems[0]), ("lidar.pool", stems[1])].map(|(name, x)| b.max_pool(name, x));
-    for (stage, (channels, blocks)) in [(64, [3, 2]), (128, [4, 2]), (256, [6, 2]), (512, [3, 2])].into_iter().enumerate()
+    for (stage, (channels, blocks)) in
+        [(64, [3, 2]), (128, [4, 2]), (256, [6, 2]), (512, [3, 2])].into_iter().enumerate()
     {
         for (branch, name) in ["image", "lidar"].into_iter().enumerate() {
             maps[branch] = b.stage(&format!("{name}.layer{}", stage + 1), maps[branch], channels, blocks[branch]);

@@ -7,8 +7,8 @@
 //! when its search is exhausted, or at a limit of search nodes. It never looks at a clock: same input, same plan.
 
 use crate::error::{Error, ErrorCode, Result};
-use crate::qmodel::QTensorId;
 use crate::qmodel::QModel;
+use crate::qmodel::QTensorId;
 use crate::schedule;
 use crate::target::Target;
 use needs::Needs;
@@ -50,6 +50,17 @@ pub enum PlanStatus {
     OptimalBoundNotReachable,
     /// The search stopped at its node limit; the gap to the bound is what could be left.
     NodeLimit,
+}
+
+impl PlanStatus {
+    /// What people read.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Optimal => "optimal",
+            Self::OptimalBoundNotReachable => "optimal, the bound is not reachable",
+            Self::NodeLimit => "search stopped at its node limit",
+        }
+    }
 }
 
 /// The plan of one model for one target.

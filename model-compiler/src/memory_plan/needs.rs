@@ -38,7 +38,8 @@ impl Needs {
         };
         check_dataflow(model)?;
         let alignment = u64::from(options.alignment);
-        let exact_bytes: Vec<u64> = (0..model.tensors.len()).map(|t| tensor_bytes(model, QTensorId(t as u32))).collect();
+        let exact_bytes: Vec<u64> =
+            (0..model.tensors.len()).map(|t| tensor_bytes(model, QTensorId(t as u32))).collect();
         let marked = |ports: &[crate::qmodel::Port]| {
             let mut marks = vec![false; model.tensors.len()];
             ports.iter().for_each(|p| marks[p.tensor.0 as usize] = true);

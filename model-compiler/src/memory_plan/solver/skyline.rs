@@ -232,7 +232,8 @@ impl<'a> State<'a> {
             if lowest.is_none_or(|(floor, ..)| s.floor < floor) {
                 lowest = Some((s.floor, start, end));
             }
-            let walled = (start == 0 || self.is_wall(start - 1, s.floor)) && (end + 1 == n || self.is_wall(end + 1, s.floor));
+            let walled =
+                (start == 0 || self.is_wall(start - 1, s.floor)) && (end + 1 == n || self.is_wall(end + 1, s.floor));
             if walled {
                 for (corner, list) in [(start, &self.by_first[start]), (end, &self.by_last[end])] {
                     if self.slack(corner) > 0 {

@@ -83,10 +83,7 @@ fn small_instance(random: &mut Random) -> Vec<Item> {
                 let split = random.range(u64::from(first), u64::from(last) - 1) as u32;
                 let smaller = 4 * random.range(1, bytes / 4);
                 return Item {
-                    spans: vec![
-                        Span { first, last: split, bytes },
-                        Span { first: split + 1, last, bytes: smaller },
-                    ],
+                    spans: vec![Span { first, last: split, bytes }, Span { first: split + 1, last, bytes: smaller }],
                 };
             }
             rectangle(first, last, bytes)
@@ -147,7 +144,13 @@ fn fills_rectangles_without_slack() {
             let items = perfect_instance(&mut Random(seed), 200 + 10 * seed as usize, steps, height, 16);
             let start = std::time::Instant::now();
             let packing = pack(&items, 2_000_000);
-            println!("seed {seed} {steps} {height} peak {} nodes {} {:?} {:?}", packing.peak, packing.nodes, packing.status, start.elapsed());
+            println!(
+                "seed {seed} {steps} {height} peak {} nodes {} {:?} {:?}",
+                packing.peak,
+                packing.nodes,
+                packing.status,
+                start.elapsed()
+            );
         }
     }
 }
