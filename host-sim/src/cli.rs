@@ -12,7 +12,6 @@ use model_compiler::error::{Error, ErrorCode, Result};
 use std::ffi::OsString;
 use std::io::Write;
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 const EXAMPLES: &str = "Examples:
   host-sim run transfuser.img --frames frames/
@@ -81,17 +80,25 @@ struct Common {
     fault: Option<String>,
 }
 
-/// Parses the arguments, runs the command, prints its result.
-pub fn main(arguments: impl IntoIterator<Item = OsString>) -> ExitCode {
+/// Where the command line writes: results to `out`, everything else to `err`.
+pub struct Console<'a> {
+    /// Standard output.
+    pub out: &'a mut dyn Write,
+    /// Standard error.
+    pub err: &'a mut dyn Write,
+}
+
+/// Parses the arguments (the first is the program), runs the command, prints its result; returns the exit status.
+pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<'_>) -> u8 {
     let arguments: Vec<OsString> = arguments.into_iter().collect();
     let cli = match Cli::try_parse_from(&arguments) {
         Ok(cli) => cli,
-        Err(error) => return usage(&error, arguments.iter().any(|argument| argument == "--json")),
+        Err(error) => return usage(&error, arguments.iter().any(|argument| argument == "--json"), &mut console),
     };
     let json = cli.command.common().json;
-    match cli.command.execute() {
+    match cli.command.execute(&mut console) {
         Ok(status) => status,
-        Err(error) => fail(&error, json),
+        Err(error) => fail(&error, json, &mut console),
     }
 }
 
@@ -102,23 +109,23 @@ impl Command {
         }
     }
 
-    fn execute(self) -> Result<ExitCode> {
+    fn execute(self, console: &mut Console<'_>) -> Result<u8> {
         self.common().inject_fault()?;
         let progress = progress_bar();
         match self {
             Self::Run { model, import, frames, common } => {
                 let report = run::run(&model, &import.options()?, &frames, &progress)?;
                 progress.finish_and_clear();
-                print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
-                Ok(ExitCode::SUCCESS)
+                console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
+                Ok(0)
             }
             Self::Verify { image, model, import, frames, record, mirror, min_sqnr, common } => {
                 let import = import.options()?;
                 let options = verify::Options { image, record, model, import, frames, mirror, min_sqnr_db: min_sqnr };
                 let report = verify::verify(&options, &progress)?;
-                warn(&report);
-                print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
-                Ok(conclude(&report, common.json))
+                warn(&report, console);
+                console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
+                Ok(conclude(&report, common.json, console))
             }
         }
     }
@@ -147,59 +154,63 @@ impl Common {
 }
 
 /// What a reader of the figures must know first.
-fn warn(report: &VerifyReport) {
+fn warn(report: &VerifyReport, console: &mut Console<'_>) {
     if !report.calibration_frames.is_empty() {
-        eprintln!(
+        console.complain(&format!(
             "warning: {} of {} frames are also calibration frames, so figures against f32 flatter: {}",
             report.calibration_frames.len(),
             report.frames.len(),
             report.calibration_frames.join(", ")
-        );
+        ));
     }
     for frame in report.frames.iter().filter(|frame| frame.dropped_points > 0) {
-        eprintln!(
-            "warning: frame {}: {} LiDAR points are not finite and were left out",
-            frame.name, frame.dropped_points
-        );
+        let (name, points) = (&frame.name, frame.dropped_points);
+        console.complain(&format!("warning: frame {name}: {points} LiDAR points are not finite and were left out"));
     }
 }
 
-fn conclude(report: &VerifyReport, json: bool) -> ExitCode {
-    match &report.failure {
-        None => ExitCode::SUCCESS,
-        Some(failure) => {
-            // The JSON document holds the failure already.
-            if !json {
-                eprintln!("error: {failure}");
-            }
-            ExitCode::from(failure.code.exit_status())
-        }
+fn conclude(report: &VerifyReport, json: bool, console: &mut Console<'_>) -> u8 {
+    let Some(failure) = &report.failure else { return 0 };
+    // The JSON document holds the failure already.
+    if !json {
+        console.complain(&format!("error: {failure}"));
     }
+    failure.code.exit_status()
 }
 
-fn fail(error: &Error, json: bool) -> ExitCode {
+fn fail(error: &Error, json: bool, console: &mut Console<'_>) -> u8 {
     if json {
-        print(&json::error(error).to_string());
+        console.print(&json::error(error).to_string());
     } else {
-        eprintln!("error: {error}");
+        console.complain(&format!("error: {error}"));
     }
-    ExitCode::from(error.code.exit_status())
+    error.code.exit_status()
 }
 
-fn usage(error: &clap::Error, json: bool) -> ExitCode {
-    if error.use_stderr() && json {
-        let text = error.render().to_string();
-        let message = text.strip_prefix("error: ").unwrap_or(&text).split("\n\nUsage:").next().unwrap_or_default();
-        return fail(&Error::new(ErrorCode::Usage, "command line", message.trim()), true);
+/// Help and version are no failures; everything else is.
+fn usage(error: &clap::Error, json: bool, console: &mut Console<'_>) -> u8 {
+    let text = error.render().to_string();
+    if !error.use_stderr() {
+        console.print(&text);
+        return 0;
     }
-    // Nothing is left to do where even this cannot be printed.
-    let _ = error.print();
-    ExitCode::from(if error.use_stderr() { 2 } else { 0 })
+    if !json {
+        console.complain(text.trim_end());
+        return ErrorCode::Usage.exit_status();
+    }
+    let message = text.strip_prefix("error: ").unwrap_or(&text).split("\n\nUsage:").next().unwrap_or_default();
+    fail(&Error::new(ErrorCode::Usage, "command line", message.trim()), true, console)
 }
 
 /// A closed pipe is the reader's choice and no error.
-fn print(text: &str) {
-    let _ = writeln!(std::io::stdout().lock(), "{}", text.trim_end());
+impl Console<'_> {
+    fn print(&mut self, text: &str) {
+        let _ = writeln!(self.out, "{}", text.trim_end());
+    }
+
+    fn complain(&mut self, text: &str) {
+        let _ = writeln!(self.err, "{text}");
+    }
 }
 
 /// On stderr, and only if that is a terminal.

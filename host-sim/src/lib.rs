@@ -14,7 +14,7 @@
 #![forbid(unsafe_code)]
 
 pub mod buffers;
-// pub mod cli;
+pub mod cli;
 pub mod codes;
 pub mod compare;
 pub mod files;

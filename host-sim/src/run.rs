@@ -75,7 +75,7 @@ fn run_image(file: &ImageFile, source: &FrameSource, progress: &ProgressBar) -> 
 
 fn run_graph(graph: &Graph, model: ModelInfo, source: &FrameSource, progress: &ProgressBar) -> Result<RunReport> {
     let frames = source.load(&FrameFormat::of_graph(graph))?;
-    if !graph.outputs.first().is_some_and(|&id| graph.value(id).shape.channels == 2) {
+    if graph.outputs.first().is_none_or(|&id| graph.value(id).shape.channels != 2) {
         return Err(no_waypoints(&graph.name));
     }
     let waypoints = each_frame(&frames, progress, |frame| {

@@ -3,7 +3,6 @@
 use super::{StepReport, VerifyReport};
 use crate::run::{FrameResult, RunReport};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
-use model_compiler::memory_plan::PlanStatus;
 use std::fmt::Write;
 
 /// Waypoints of every frame.
@@ -69,14 +68,13 @@ fn summary(text: &mut String, report: &VerifyReport) {
             error.max
         );
     }
-    let status = match s.arena_status {
-        PlanStatus::Optimal => "optimal: equals its lower bound".to_owned(),
-        PlanStatus::OptimalBoundNotReachable => {
-            format!("optimal; the bound of {} B is not reachable", s.arena_bound_bytes)
-        }
-        PlanStatus::NodeLimit => format!("search stopped; lower bound {} B", s.arena_bound_bytes),
-    };
-    let _ = writeln!(text, "arena                  {} B, {status}", s.arena_bytes);
+    let _ = writeln!(
+        text,
+        "arena                  {} B, lower bound {} B: {}",
+        s.arena_bytes,
+        s.arena_bound_bytes,
+        s.arena_status.words()
+    );
     let _ = writeln!(text, "flash                  {} B", s.flash_bytes);
 }
 
@@ -123,9 +121,15 @@ mod tests {
     #[test]
     fn a_verification_shows_steps_and_summary() {
         let text = verify(&super::super::tests::report());
-        for expected in
-            ["local dB", "conv1", "64×64×64", "21.5", "waypoint 1", "1.2 mm off on average, 2.5 mm", "2048 B, optimal"]
-        {
+        for expected in [
+            "local dB",
+            "conv1",
+            "64×64×64",
+            "21.5",
+            "waypoint 1",
+            "1.2 mm off on average, 2.5 mm",
+            "lower bound 2048 B: optimal",
+        ] {
             assert!(text.contains(expected), "{expected} in\n{text}");
         }
         assert!(text.contains("equal in every step"), "{text}");
