@@ -13,6 +13,7 @@
 //! [`trace`] takes one frame that way; memory holds one frame at a time, figures are summed over frames.
 #![forbid(unsafe_code)]
 
+pub mod ablation;
 pub mod buffers;
 pub mod cli;
 pub mod codes;
