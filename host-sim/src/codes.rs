@@ -14,6 +14,16 @@ pub fn decode(bytes: &[u8], element: ElementType) -> Vec<i32> {
     }
 }
 
+/// Name of an element type in reports.
+pub fn element_name(element: ElementType) -> &'static str {
+    match element {
+        ElementType::I8 => "i8",
+        ElementType::I16 => "i16",
+        ElementType::I32 => "i32",
+        ElementType::Scratch => "scratch",
+    }
+}
+
 /// `scale · (code − zero_point)` of every code of a tensor.
 pub fn dequantize(tensor: &QTensor, codes: &[i32]) -> Vec<f32> {
     let real = |&code: &i32| (tensor.scale * (f64::from(code) - f64::from(tensor.zero_point))) as f32;

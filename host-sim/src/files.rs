@@ -106,8 +106,8 @@ pub fn file_sha256(path: &Path) -> Result<String> {
 ///
 /// # Errors
 /// The file is no checkpoint of a known system.
-pub fn load_graph(path: &Path) -> Result<Graph> {
-    pipeline::load_graph(path, &ImportOptions::default(), &PassOptions::default())
+pub fn load_graph(path: &Path, import: &ImportOptions) -> Result<Graph> {
+    pipeline::load_graph(path, import, &PassOptions::default())
 }
 
 /// Where frames come from.

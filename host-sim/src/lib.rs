@@ -15,12 +15,15 @@
 
 pub mod ablation;
 pub mod buffers;
-// pub mod cli;
+pub mod cli;
 pub mod codes;
 pub mod compare;
 pub mod files;
-// pub mod report;
-// pub mod run;
+pub mod report;
+pub mod run;
 pub mod statistics;
 pub mod trace;
-// pub mod verify;
+pub mod verify;
+
+#[cfg(test)]
+mod testing;
