@@ -48,7 +48,8 @@ impl GuardedArena {
             None => Ok(()),
             Some(i) => {
                 let offset = i as i64 - self.first as i64;
-                let message = format!("a byte outside was written: offset {offset} of an arena of {} bytes", self.length);
+                let message =
+                    format!("a byte outside was written: offset {offset} of an arena of {} bytes", self.length);
                 Err(Error::new(ErrorCode::Check, "arena", message))
             }
         }

@@ -14,6 +14,16 @@ pub fn decode(bytes: &[u8], element: ElementType) -> Vec<i32> {
     }
 }
 
+/// Name of an element type in reports.
+pub fn element_name(element: ElementType) -> &'static str {
+    match element {
+        ElementType::I8 => "i8",
+        ElementType::I16 => "i16",
+        ElementType::I32 => "i32",
+        ElementType::Scratch => "scratch",
+    }
+}
+
 /// `scale · (code − zero_point)` of every code of a tensor.
 pub fn dequantize(tensor: &QTensor, codes: &[i32]) -> Vec<f32> {
     let real = |&code: &i32| (tensor.scale * (f64::from(code) - f64::from(tensor.zero_point))) as f32;
@@ -48,7 +58,8 @@ impl SaturationBounds {
 
     /// How many codes lie at a bound.
     pub fn count(&self, codes: &[i32]) -> u64 {
-        let at_bound = |&&code: &&i32| code == i32::from(self.max) || self.min.is_some_and(|min| code == i32::from(min));
+        let at_bound =
+            |&&code: &&i32| code == i32::from(self.max) || self.min.is_some_and(|min| code == i32::from(min));
         codes.iter().filter(at_bound).count() as u64
     }
 }

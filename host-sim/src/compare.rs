@@ -28,7 +28,12 @@ pub fn first_difference(found: &[u8], expected: &[u8], element: ElementType) -> 
     let mut unequal = (0..length).filter(|&i| found.get(i) != expected.get(i));
     let index = unequal.next()?;
     let differing = 1 + unequal.count();
-    Some(ElementDifference { index, found: found.get(index).copied(), expected: expected.get(index).copied(), differing })
+    Some(ElementDifference {
+        index,
+        found: found.get(index).copied(),
+        expected: expected.get(index).copied(),
+        differing,
+    })
 }
 
 /// The first unequal step of a frame, in the order of execution.

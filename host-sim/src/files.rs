@@ -67,8 +67,10 @@ impl ImageFile {
         if record.image_sha256 != self.sha256() {
             let found = artifact::hex(&self.sha256()[..8]);
             let expected = artifact::hex(&record.image_sha256[..8]);
-            let message =
-                format!("the record belongs to another image: digest of {} is {found}…, expected {expected}…", self.path.display());
+            let message = format!(
+                "the record belongs to another image: digest of {} is {found}…, expected {expected}…",
+                self.path.display()
+            );
             let error = Error::new(ErrorCode::Malformed, path.display().to_string(), message);
             return Err(error.with_help("compile again, or keep OUT.img and OUT.record of one build together"));
         }
@@ -104,8 +106,8 @@ pub fn file_sha256(path: &Path) -> Result<String> {
 ///
 /// # Errors
 /// The file is no checkpoint of a known system.
-pub fn load_graph(path: &Path) -> Result<Graph> {
-    pipeline::load_graph(path, &ImportOptions::default(), &PassOptions::default())
+pub fn load_graph(path: &Path, import: &ImportOptions) -> Result<Graph> {
+    pipeline::load_graph(path, import, &PassOptions::default())
 }
 
 /// Where frames come from.
@@ -131,7 +133,9 @@ impl FrameSource {
             (Some(path), _) if path.is_file() => usage(path, "--frames takes a directory; a file goes to --inputs"),
             (None, Some(path)) if path.is_dir() => usage(path, "--inputs takes a file; a directory goes to --frames"),
             (Some(path), _) | (None, Some(path)) => frames::load(path, format),
-            (None, None) => Err(Error::new(ErrorCode::Usage, "", "no frames given").with_help("--frames DIR or --inputs FILE")),
+            (None, None) => {
+                Err(Error::new(ErrorCode::Usage, "", "no frames given").with_help("--frames DIR or --inputs FILE"))
+            }
         }
     }
 }

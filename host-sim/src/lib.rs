@@ -13,6 +13,7 @@
 //! [`trace`] takes one frame that way; memory holds one frame at a time, figures are summed over frames.
 #![forbid(unsafe_code)]
 
+pub mod ablation;
 pub mod buffers;
 pub mod cli;
 pub mod codes;
@@ -23,3 +24,6 @@ pub mod run;
 pub mod statistics;
 pub mod trace;
 pub mod verify;
+
+#[cfg(test)]
+mod testing;

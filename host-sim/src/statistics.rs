@@ -24,11 +24,13 @@ impl ErrorSums {
             self.test_power += t * t;
             self.error_power += error * error;
             self.dot += r * t;
-            self.largest_error = self.largest_error.max(error.abs());
+            if error.abs() > self.largest_error || error.is_nan() {
+                self.largest_error = error.abs();
+            }
         }
     }
 
-    /// `10·log10(Σ ref² / Σ (ref − test)²)`; infinite where nothing differs.
+    /// `10·log10(Σ ref² / Σ (ref − test)²)`; infinite where nothing differs, not a number where a value is none.
     pub fn sqnr_db(&self) -> f64 {
         if self.error_power == 0.0 { f64::INFINITY } else { 10.0 * (self.reference_power / self.error_power).log10() }
     }
@@ -39,7 +41,7 @@ impl ErrorSums {
             return 1.0;
         }
         let norms = (self.reference_power * self.test_power).sqrt();
-        if norms == 0.0 { 0.0 } else { self.dot / norms }
+        if norms == 0.0 { 0.0 } else { (self.dot / norms).clamp(-1.0, 1.0) }
     }
 
     /// The largest difference of a pair, in units of the values.
@@ -101,6 +103,13 @@ mod tests {
         let mut invented = ErrorSums::default();
         invented.add(&[0.0], &[1.0]);
         assert_eq!(invented.sqnr_db(), f64::NEG_INFINITY);
+    }
+
+    #[test]
+    fn not_a_number_is_never_hidden() {
+        let mut sums = ErrorSums::default();
+        sums.add(&[1.0, f32::NAN, 1.0], &[1.0, 1.0, 5.0]);
+        assert!(sums.sqnr_db().is_nan() && sums.cosine().is_nan() && sums.largest_error().is_nan());
     }
 
     #[test]

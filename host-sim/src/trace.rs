@@ -130,7 +130,8 @@ impl<'a> Tracer<'a> {
         self.frames += 1;
         self.count_saturation(&run);
         let reference_outputs = self.measure(frame, &run, progress)?;
-        let outputs = model.outputs.iter().zip(&run.outputs).map(|(port, bytes)| real(model.tensor(port.tensor), bytes));
+        let outputs =
+            model.outputs.iter().zip(&run.outputs).map(|(port, bytes)| real(model.tensor(port.tensor), bytes));
         Ok(FrameTrace { difference, outputs: outputs.collect(), reference_outputs })
     }
 
@@ -331,7 +332,8 @@ fn kept(activations: &Activations, id: ValueId) -> &[f32] {
 
 fn find_value(graph: &Graph, tensor: &QTensor) -> Result<ValueId> {
     let id = graph.find(&tensor.value);
-    let id = id.ok_or_else(|| foreign(format!("it has no value {}, which tensor {} stands for", tensor.value, tensor.name)))?;
+    let id = id
+        .ok_or_else(|| foreign(format!("it has no value {}, which tensor {} stands for", tensor.value, tensor.name)))?;
     let shape = graph.value(id).shape;
     if shape.elements() != tensor.shape.elements() {
         return Err(foreign(format!("value {} is {shape:?}, in the record {:?}", tensor.value, tensor.shape)));

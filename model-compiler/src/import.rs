@@ -93,6 +93,19 @@ impl NamedTensors {
     }
 }
 
+impl From<checkpoint::Checkpoint> for NamedTensors {
+    fn from(checkpoint: checkpoint::Checkpoint) -> Self {
+        let tensors = checkpoint.into_tensors().into_iter().map(|tensor| {
+            let data = match tensor.data {
+                checkpoint::TensorData::Float(values) => TensorData::Float(values),
+                checkpoint::TensorData::Integer(_) => TensorData::Integer,
+            };
+            (tensor.name, NamedTensor { shape: tensor.shape, data })
+        });
+        Self { tensors: tensors.collect() }
+    }
+}
+
 /// A driving network that is told from its tensor names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum System {

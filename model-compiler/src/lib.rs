@@ -3,6 +3,7 @@
 
 pub mod artifact;
 pub mod calibrate;
+pub mod cli;
 pub mod emit;
 pub mod error;
 pub mod frames;
@@ -13,6 +14,7 @@ pub mod memory_plan;
 pub mod metrics;
 pub mod pack;
 pub mod passes;
+pub mod pipeline;
 pub mod qmodel;
 pub mod quantize;
 pub mod record;

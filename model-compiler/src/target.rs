@@ -1,1 +1,302 @@
-//! target
+//! Targets: what a plan must fit, as data. A new chip is a new description, not new code.
+//!
+//! Built in are families without sizes; `--ram` and `--flash` or a TOML file add them:
+//!
+//! ```toml
+//! name = "my-board"
+//! alignment = 4            # of tensors, bytes; a power of two
+//! flash = "2M"             # bytes, or with K or M (1024, 1024²); absent: unlimited
+//! kernels = ["direct"]     # absent: direct
+//!
+//! [[regions]]              # RAM; the arena lies in the first
+//! name = "main"
+//! bytes = "1536K"
+//! ```
+
+use crate::error::{Error, ErrorCode, Result};
+use crate::memory_plan::{MemoryPlan, PlanStatus};
+use crate::qmodel::QModel;
+use firmware::program::KernelId;
+use serde::Deserialize;
+use std::fmt::Write as _;
+use std::path::Path;
+
+/// A kind of machine.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Target {
+    /// Name in messages and records.
+    pub name: String,
+    /// RAM, at least one region; the arena lies in the first.
+    pub regions: Vec<Region>,
+    /// Room for the image, bytes; `None`: unlimited.
+    pub flash_bytes: Option<u64>,
+    /// Alignment of tensors in the arena, bytes.
+    pub alignment: u32,
+    /// Kernels that the runtime there has; the first is used.
+    pub kernels: Vec<KernelId>,
+}
+
+/// A named memory.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Region {
+    /// `main`, `fast`, `slow`.
+    pub name: String,
+    /// Size; `None`: unlimited.
+    pub bytes: Option<u64>,
+}
+
+/// Built-in names with the alignment of tensors.
+const BUILT_IN: [(&str, u32); 6] =
+    [("portable", 4), ("x86", 64), ("cortex-m4", 4), ("cortex-m7", 4), ("cortex-m55", 4), ("cortex-a", 16)];
+
+/// Buffers listed in a message at most.
+const MAX_LISTED: usize = 12;
+
+impl Target {
+    /// A built-in target, or one read from a `.toml` file.
+    ///
+    /// # Errors
+    /// Unknown name, unreadable file, or a file that is no target.
+    pub fn find(name: &str) -> Result<Self> {
+        if let Some(&(name, alignment)) = BUILT_IN.iter().find(|(known, _)| *known == name) {
+            return Ok(Self {
+                name: name.into(),
+                regions: vec![Region { name: "main".into(), bytes: None }],
+                flash_bytes: None,
+                alignment,
+                kernels: vec![KernelId::Direct],
+            });
+        }
+        if Path::new(name).extension().is_none_or(|e| e != "toml") {
+            let names: Vec<&str> = BUILT_IN.iter().map(|b| b.0).collect();
+            return Err(Error::new(ErrorCode::Usage, "target", format!("unknown target '{name}'"))
+                .with_help(format!("use one of {}, or a file FILE.toml", names.join(", "))));
+        }
+        let text = std::fs::read_to_string(name).map_err(|e| Error::io(Path::new(name), &e))?;
+        Self::parse(&text).map_err(|e| e.within(name))
+    }
+
+    /// Reads a description; the format is on the module page.
+    ///
+    /// # Errors
+    /// Not TOML, unknown or missing fields, or values out of range.
+    pub fn parse(text: &str) -> Result<Self> {
+        let file: File = toml::from_str(text).map_err(|e| {
+            Error::new(ErrorCode::Malformed, "", e.to_string().trim_end())
+                .with_help("fields: name, alignment, flash, kernels, [[regions]] with name and bytes")
+        })?;
+        if !file.alignment.is_power_of_two() || !(4..=4096).contains(&file.alignment) {
+            let message = format!("found {}, expected a power of two from 4 to 4096", file.alignment);
+            return Err(Error::new(ErrorCode::Malformed, "alignment", message));
+        }
+        if file.regions.is_empty() {
+            return Err(Error::new(ErrorCode::Malformed, "regions", "found none, expected at least one"));
+        }
+        let kernels = file.kernels.unwrap_or_else(|| vec!["direct".into()]);
+        if kernels.is_empty() {
+            return Err(Error::new(ErrorCode::Malformed, "kernels", "found none, expected at least one"));
+        }
+        let region = |r: RegionFile| {
+            let bytes = r.bytes.map(|b| b.bytes(&format!("region {}", r.name))).transpose()?;
+            Ok(Region { name: r.name, bytes })
+        };
+        Ok(Self {
+            name: file.name,
+            regions: file.regions.into_iter().map(region).collect::<Result<_>>()?,
+            flash_bytes: file.flash.map(|f| f.bytes("flash")).transpose()?,
+            alignment: file.alignment,
+            kernels: kernels.iter().map(|k| kernel(k)).collect::<Result<_>>()?,
+        })
+    }
+
+    /// The target with other limits where given (`--ram`, `--flash`); RAM is the first region's.
+    #[must_use]
+    pub fn with_limits(mut self, ram_bytes: Option<u64>, flash_bytes: Option<u64>) -> Self {
+        if let (Some(region), Some(bytes)) = (self.regions.first_mut(), ram_bytes) {
+            region.bytes = Some(bytes);
+        }
+        self.flash_bytes = flash_bytes.or(self.flash_bytes);
+        self
+    }
+
+    /// RAM for the arena; `None`: unlimited.
+    pub fn ram_bytes(&self) -> Option<u64> {
+        self.regions.first().and_then(|r| r.bytes)
+    }
+
+    /// Whether plan and image fit.
+    ///
+    /// # Errors
+    /// `TooBig`: what is too big by how much; for the arena also the step at the peak and what is live there.
+    pub fn fits(&self, model: &QModel, plan: &MemoryPlan, image_bytes: u64) -> Result<()> {
+        if let Some(limit) = self.ram_bytes().filter(|&limit| plan.arena_bytes > limit) {
+            return Err(self.too_big("arena", plan.arena_bytes, limit, &live_list(model, plan)).with_help(help(plan)));
+        }
+        if let Some(limit) = self.flash_bytes.filter(|&limit| image_bytes > limit) {
+            let help = "use a target with more flash (--flash), or a smaller network";
+            return Err(self.too_big("image", image_bytes, limit, "").with_help(help));
+        }
+        Ok(())
+    }
+
+    fn too_big(&self, what: &str, needed: u64, limit: u64, details: &str) -> Error {
+        let over = needed - limit;
+        let message = format!("the {what} needs {needed} bytes, {limit} are there: {over} too many{details}");
+        Error::new(ErrorCode::TooBig, format!("target {}", self.name), message)
+    }
+}
+
+/// Parses a size: bytes, or with `K` or `M` (1024, 1024²).
+///
+/// # Errors
+/// Not a whole number, or beyond 64 bits.
+pub fn parse_size(text: &str) -> Result<u64> {
+    let trimmed = text.trim();
+    let (digits, unit) = match trimmed.as_bytes().last() {
+        Some(b'K' | b'k') => (&trimmed[..trimmed.len() - 1], 1 << 10),
+        Some(b'M' | b'm') => (&trimmed[..trimmed.len() - 1], 1 << 20),
+        _ => (trimmed, 1),
+    };
+    let plain = !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit());
+    let value = digits.parse::<u64>().ok().filter(|_| plain).and_then(|n| n.checked_mul(unit));
+    value.ok_or_else(|| {
+        Error::new(ErrorCode::Usage, "size", format!("found '{text}', expected a number of bytes"))
+            .with_help("for example 524288, 512K or 2M")
+    })
+}
+
+fn kernel(name: &str) -> Result<KernelId> {
+    match name {
+        "direct" => Ok(KernelId::Direct),
+        _ => Err(Error::new(ErrorCode::Malformed, "kernels", format!("found '{name}', expected 'direct'"))),
+    }
+}
+
+fn help(plan: &MemoryPlan) -> String {
+    let proof = match plan.status {
+        PlanStatus::Optimal => "no plan for this order is smaller".to_string(),
+        PlanStatus::OptimalBoundNotReachable => format!("no plan is smaller; the bound is {}", plan.bound_bytes),
+        PlanStatus::NodeLimit => format!("the search was cut short; the bound is {}", plan.bound_bytes),
+    };
+    format!("use a target with more RAM (--ram), or a smaller network; {proof}")
+}
+
+/// The peak step and its live buffers, largest first, in columns.
+fn live_list(model: &QModel, plan: &MemoryPlan) -> String {
+    let peak = plan.peak_step;
+    let Some(&step) = plan.order.get(peak as usize) else { return String::new() };
+    let mut live: Vec<(String, u64)> = model
+        .tensors
+        .iter()
+        .zip(&plan.tensors)
+        .filter(|(_, p)| (p.first_step..=p.last_step).contains(&peak))
+        .map(|(t, p)| {
+            let shared = p.in_place_of.filter(|_| p.first_step == peak);
+            let note = shared.map(|o| format!(" (over {})", model.tensor(o).name)).unwrap_or_default();
+            (format!("{}{note}", t.name), p.bytes)
+        })
+        .collect();
+    live.extend(plan.scratch[peak as usize].iter().map(|p| ("scratch".to_string(), p.bytes)));
+    live.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
+    let mut text = format!("\nat the peak, step {} ({}), these are live:", peak, model.steps[step as usize].name);
+    let width = live.iter().take(MAX_LISTED).map(|(name, _)| name.len()).max().unwrap_or(0);
+    for (name, bytes) in live.iter().take(MAX_LISTED) {
+        let _ = write!(text, "\n  {name:width$}  {bytes:>10}");
+    }
+    if live.len() > MAX_LISTED {
+        let rest: u64 = live[MAX_LISTED..].iter().map(|l| l.1).sum();
+        let _ = write!(text, "\n  {:width$}  {rest:>10}", format!("{} more", live.len() - MAX_LISTED));
+    }
+    text
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    name: String,
+    alignment: u32,
+    flash: Option<Size>,
+    kernels: Option<Vec<String>>,
+    #[serde(default)]
+    regions: Vec<RegionFile>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct RegionFile {
+    name: String,
+    bytes: Option<Size>,
+}
+
+#[derive(Deserialize)]
+#[serde(untagged, expecting = "expected a number of bytes, or text such as \"512K\"")]
+enum Size {
+    Bytes(u64),
+    Text(String),
+}
+
+impl Size {
+    fn bytes(self, place: &str) -> Result<u64> {
+        match self {
+            Self::Bytes(bytes) => Ok(bytes),
+            Self::Text(text) => parse_size(&text).map_err(|e| e.within(place)),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sizes_have_suffixes() {
+        assert_eq!(parse_size("1536K"), Ok(1_572_864));
+        assert_eq!(parse_size(" 2M "), Ok(2 << 20));
+        assert_eq!(parse_size("77"), Ok(77));
+        for bad in ["", "K", "-1", "+1", "1.5M", "2G", "18446744073709551615K", "é"] {
+            assert!(parse_size(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn built_in_targets_are_unlimited_until_limits_are_set() {
+        for (name, alignment) in BUILT_IN {
+            let target = Target::find(name).unwrap();
+            assert_eq!((target.alignment, target.ram_bytes(), target.flash_bytes), (alignment, None, None), "{name}");
+            let small = target.with_limits(Some(1), Some(2));
+            assert_eq!((small.ram_bytes(), small.flash_bytes), (Some(1), Some(2)));
+        }
+        let error = Target::find("cortex-m5").unwrap_err();
+        assert!(error.message.contains("'cortex-m5'") && error.help.contains("cortex-m55"), "{error}");
+        assert_eq!(Target::find("absent.toml").unwrap_err().code, ErrorCode::Io);
+    }
+
+    const BOARD: &str = "name = 'b'\nalignment = 16\nflash = '2M'\n[[regions]]\nname = 'main'\nbytes = 1000\n";
+
+    #[test]
+    fn reads_a_description() {
+        let target = Target::parse(BOARD).unwrap();
+        let regions = vec![Region { name: "main".into(), bytes: Some(1000) }];
+        let kernels = vec![KernelId::Direct];
+        let expected = Target { name: "b".into(), regions, flash_bytes: Some(2 << 20), alignment: 16, kernels };
+        assert_eq!(target, expected);
+    }
+
+    #[test]
+    fn refuses_descriptions_with_a_reason() {
+        let cases = [
+            (BOARD.replace("flash", "falsh"), "falsh"),
+            (BOARD.replace("= 16", "= 12"), "alignment"),
+            (BOARD.replace("'2M'", "'2X'"), "flash"),
+            (BOARD.replace("1000", "-5"), "bytes"),
+            (BOARD.replace("flash = '2M'", "kernels = ['amx']"), "amx"),
+            (BOARD.replace("flash = '2M'", "kernels = []"), "kernels"),
+            (BOARD.lines().take(3).collect::<Vec<_>>().join("\n"), "regions"),
+            (BOARD.lines().skip(1).collect::<Vec<_>>().join("\n"), "name"),
+        ];
+        for (text, reason) in cases {
+            let error = Target::parse(&text).unwrap_err().to_string();
+            assert!(error.contains(reason), "{reason} not in: {error}");
+        }
+    }
+}

@@ -62,7 +62,7 @@ checks! {
     TensorBatch: "the batch size must be 1 (0 for scratch)",
     TensorShape: "a tensor must not be empty, scratch has no shape",
     TensorBytes: "the length differs from what shape and type imply",
-    TensorAlignment: "the arena offset must be a multiple of 16",
+    TensorAlignment: "the arena offset must be a multiple of 4",
     TensorInside: "the tensor ends outside the arena",
     TensorLive: "the live range is reversed or ends behind the program",
     TensorWritten: "no step (or not the one recorded) writes this tensor",

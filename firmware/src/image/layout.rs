@@ -9,6 +9,9 @@ pub const MAGIC: [u8; 8] = *b"\x93DRIVE\r\n";
 pub const FORMAT: u16 = 1;
 /// Base address, sections, constant ranges and tensors are aligned to this many bytes.
 pub const ALIGNMENT: usize = 16;
+
+/// Offsets in the arena are multiples of this: the widest element that the operators view there.
+pub const ARENA_OFFSET_ALIGNMENT: usize = 4;
 /// Largest number of steps.
 pub const MAX_STEPS: u16 = 2048;
 /// Largest number of tensor records.
@@ -130,7 +133,7 @@ pub mod tensor {
     pub const ELEMENT: Range<usize> = 1..2;
     /// `u16`: tensor whose memory this one takes over, or [`NOT_IN_PLACE`].
     pub const IN_PLACE_OF: Range<usize> = 2..4;
-    /// `u32`: first byte in the arena, a multiple of 16.
+    /// `u32`: first byte in the arena, a multiple of 4.
     pub const OFFSET: Range<usize> = 4..8;
     /// `u32`: length.
     pub const LENGTH: Range<usize> = 8..12;

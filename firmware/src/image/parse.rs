@@ -209,7 +209,7 @@ fn check_tensor(image: &Image<'_>, id: u16) -> Result<(), ParseError> {
     let length = u64::from(record.bytes);
     let exact = if scratch { length != 0 } else { length == implied };
     ensure(Check::TensorBytes, place, exact, shown(length), shown(implied.max(1)))?;
-    let remainder = index(record.offset) % layout::ALIGNMENT;
+    let remainder = index(record.offset) % layout::ARENA_OFFSET_ALIGNMENT;
     ensure_equal(Check::TensorAlignment, place, shown(remainder as u64), 0)?;
     let inside = record.end() <= u64::from(image.arena_bytes);
     ensure(Check::TensorInside, place, inside, shown(record.end()), image.arena_bytes)?;

@@ -12,7 +12,7 @@ pub struct TensorRecord {
     pub element: ElementType,
     /// Shape; all zero for scratch.
     pub shape: Shape,
-    /// First byte in the arena, a multiple of 16.
+    /// First byte in the arena, a multiple of 4.
     pub offset: u32,
     /// Length in bytes, without rounding.
     pub bytes: u32,

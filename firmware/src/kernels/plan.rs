@@ -74,3 +74,106 @@ fn signed(index: usize) -> i64 {
 const fn saturate(bytes: u64) -> u32 {
     if bytes > u32::MAX as u64 { u32::MAX } else { bytes as u32 }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Simulates the raster order: output pixel i overwrites input pixel i; is a pixel ever read after that?
+    fn never_reads_overwritten(input: Shape, output: Shape, window: Window) -> bool {
+        let axis = |out: u16, tap: u8, stride: u8, dilation: u8, pad: u8, size: u16| {
+            let at = i32::from(out) * i32::from(stride) + i32::from(tap) * i32::from(dilation) - i32::from(pad);
+            (0..i32::from(size)).contains(&at).then_some(at)
+        };
+        let mut written = 0;
+        for y in 0..output.height {
+            for x in 0..output.width {
+                for ky in 0..window.kernel_h {
+                    for kx in 0..window.kernel_w {
+                        let row = axis(y, ky, window.stride_h, window.dilation_h, window.pad_top, input.height);
+                        let column = axis(x, kx, window.stride_w, window.dilation_w, window.pad_left, input.width);
+                        if let (Some(row), Some(column)) = (row, column)
+                            && row * i32::from(input.width) + column < written
+                        {
+                            return false;
+                        }
+                    }
+                }
+                written += 1;
+            }
+        }
+        output.elements() <= input.elements()
+    }
+
+    #[test]
+    fn max_pool_in_place_equals_a_simulation() {
+        let (mut allowed, mut forbidden) = (0, 0);
+        let digits = |code: u32| [code % 3, code / 3 % 3, code / 9 % 3, code / 27 % 3].map(|d| d as u8);
+        for code in 0..81 * 27 {
+            let [kernel_h, kernel_w, stride_h, stride_w] = digits(code % 81).map(|d| d + 1);
+            let [pad_top, pad_left, dilation, _] = digits(code / 81);
+            let window = Window {
+                kernel_h,
+                kernel_w,
+                stride_h,
+                stride_w,
+                pad_top,
+                pad_bottom: pad_top,
+                pad_left,
+                pad_right: pad_left.saturating_sub(1),
+                dilation_h: dilation + 1,
+                dilation_w: 1 + dilation % 2,
+            };
+            for (height, width) in [(1, 1), (1, 5), (4, 1), (2, 3), (3, 2), (5, 4), (4, 7)] {
+                let Some((out_height, out_width)) = window.output_size(height, width) else { continue };
+                let (input, output) = (Shape::map(height, width, 2), Shape::map(out_height, out_width, 2));
+                let expected = never_reads_overwritten(input, output, window);
+                assert_eq!(max_pool_in_place(input, output, window), expected, "{input:?} {window:?}");
+                *(if expected { &mut allowed } else { &mut forbidden }) += 1;
+            }
+        }
+        assert!(allowed > 1000 && forbidden > 1000, "{allowed} allowed, {forbidden} forbidden");
+    }
+
+    #[test]
+    fn transfusers_stem_pool_may_run_in_place() {
+        let window = Window {
+            kernel_h: 3,
+            kernel_w: 3,
+            stride_h: 2,
+            stride_w: 2,
+            pad_top: 1,
+            pad_bottom: 1,
+            pad_left: 1,
+            pad_right: 1,
+            dilation_h: 1,
+            dilation_w: 1,
+        };
+        assert!(max_pool_in_place(Shape::map(128, 128, 64), Shape::map(64, 64, 64), window));
+        assert!(!max_pool_in_place(Shape::map(128, 128, 64), Shape::map(64, 64, 32), window), "channels differ");
+    }
+
+    #[test]
+    fn scratch_of_hostile_shapes_is_a_number() {
+        let all = Shape::map(u16::MAX, u16::MAX, u16::MAX);
+        let window = Window {
+            kernel_h: 255,
+            kernel_w: 255,
+            stride_h: 0,
+            stride_w: 0,
+            pad_top: 255,
+            pad_bottom: 255,
+            pad_left: 255,
+            pad_right: 255,
+            dilation_h: 255,
+            dilation_w: 255,
+        };
+        assert_eq!(conv2d_scratch_bytes(KernelId::Direct, all, all, window, 1), u32::MAX);
+        assert_eq!(conv2d_scratch_bytes(KernelId::Direct, all, all, window, 0), 0);
+        assert_eq!(attention_scratch_bytes(u32::MAX, u16::MAX, 1), u32::MAX);
+        assert_eq!(attention_scratch_bytes(1, 1, 0), 0);
+        assert_eq!(linear_scratch_bytes(KernelId::Direct, u16::MAX, 1, ElementType::I8), 8 * 65535);
+        assert_eq!(waypoint_decoder_scratch_bytes(u16::MAX), 4 * 65535);
+        assert!(!max_pool_in_place(all, all, Window { stride_h: 0, ..window }));
+    }
+}

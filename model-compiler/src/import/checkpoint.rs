@@ -110,6 +110,11 @@ impl Checkpoint {
         &self.tensors
     }
 
+    /// Gives up the tensors, in file order.
+    pub fn into_tensors(self) -> Vec<NamedTensor> {
+        self.tensors
+    }
+
     /// The tensor of this name.
     pub fn get(&self, name: &str) -> Option<&NamedTensor> {
         self.index.get(name).map(|&at| &self.tensors[at])
@@ -149,7 +154,7 @@ impl Checkpoint {
         for (at, tensor) in contents.tensors.iter().enumerate() {
             if index.insert(tensor.name.clone(), at).is_some() {
                 let place = format!("tensor {}", quoted(&tensor.name));
-                return Err(Error::new(ErrorCode::Malformed, place, "found twice, expected once per file"));
+                return Err(malformed(place, "found twice, expected once per file"));
             }
         }
         Ok(Self { tensors: contents.tensors, index, skipped: contents.skipped, sha256, format })

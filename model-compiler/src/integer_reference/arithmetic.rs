@@ -18,8 +18,7 @@ impl Exactness {
     /// Watches one intermediate and hands it on.
     #[inline]
     pub(super) fn watch(&mut self, value: f64) -> f64 {
-        // Not `>=`: a NaN counts as lost.
-        self.lost |= !(value.abs() < EXACT_LIMIT);
+        self.lost |= value.abs() >= EXACT_LIMIT || value.is_nan();
         value
     }
 

@@ -146,7 +146,7 @@ mod tests {
         let mut exact = Exactness::default();
         let mut weight = |u: f64| softmax.weight(u, &mut exact);
         assert_eq!(weight(0.0), 32767.0);
-        // 32767/2 is a tie; 2^(−1/256) is an entry of its own, half way to it a linear mean (32722.5, ties up).
+        // 32767/2 is a tie; 2^(−1/256) is an entry of its own, and half way to it lies the mean of both entries.
         assert_eq!(weight(65536.0), 16384.0);
         assert_eq!(weight(256.0), f64::from(exp_table()[1]));
         assert_eq!(weight(128.0), ((32767.0 + f64::from(exp_table()[1])) / 2.0 + 0.5).floor());
@@ -238,7 +238,7 @@ mod tests {
                 let values = (0..usize::from(tokens)).map(|r| value[r * usize::from(channels) + channel]);
                 let mean = weights.iter().zip(values).map(|(w, v)| w * v).sum::<f64>() / weights.iter().sum::<f64>();
                 let error = (found / case.gain - mean).abs();
-                assert!(error < 0.05, "{} for {mean} at {row},{channel}, seed {seed:#x}", found / case.gain);
+                assert!(error < 0.03, "{} for {mean} at {row},{channel}, seed {seed:#x}", found / case.gain);
             }
         }
     }

@@ -165,7 +165,7 @@ mod tests {
         };
         let operands = [(shape, ElementType::I8, maps[0].clone()), (shape, ElementType::I16, maps[1].clone())];
         let codes = execute_alone(op, &operands, (Shape::vector(12), ElementType::I16)).unwrap();
-        for channel in 0..channels {
+        for (channel, &code) in codes.iter().enumerate() {
             let sum = |map: &[f64], term: QTerm| {
                 let of_channel = map.iter().skip(channel).step_by(channels);
                 of_channel
@@ -173,7 +173,7 @@ mod tests {
                     .sum::<i128>()
             };
             let expected = rounding_shift(sum(&maps[0], first) + sum(&maps[1], second), 33).clamp(-32768, 32767);
-            assert_eq!(codes[channel] as i128, expected, "channel {channel}, seed {seed:#x}");
+            assert_eq!(code as i128, expected, "channel {channel}, seed {seed:#x}");
         }
     }
 }

@@ -233,8 +233,8 @@ mod tests {
             let (tanh, sigmoid) = (gates.tanh(code, &mut exact), gates.sigmoid(code, &mut exact));
             assert!(tanh >= last.0 && sigmoid >= last.1, "x = {x}");
             assert_eq!(gates.tanh(-code, &mut exact), -tanh, "x = {x}");
-            assert!((tanh - 32768.0 * real.tanh()).abs() < 2.0, "x = {x}: {tanh}");
-            assert!((sigmoid - 32768.0 / (1.0 + (-real).exp())).abs() < 13.0, "x = {x}: {sigmoid}");
+            assert!((tanh - 32768.0 * real.tanh()).abs() < 1.8, "x = {x}: {tanh}");
+            assert!((sigmoid - 32768.0 / (1.0 + (-real).exp())).abs() < 1.5, "x = {x}: {sigmoid}");
             let mirrored = sigmoid + gates.sigmoid(-code, &mut exact);
             assert!((mirrored - 32768.0).abs() <= 1.0, "x = {x}: {mirrored}");
             last = (tanh, sigmoid);
@@ -391,7 +391,7 @@ mod tests {
         let mut random = Random(seed);
         for round_number in 0..40 {
             let concat = round_number % 2 == 1;
-            let fraction_bits = [15, 13, 11][round_number % 3];
+            let fraction_bits = [15, 13, 12][round_number % 3];
             let float = Float::random(&mut random, 64, concat);
             let limit = 32767.0 / f64::from(fraction_bits).exp2();
             let state: Vec<f64> = random.codes(64, 0, 32767);
@@ -400,9 +400,9 @@ mod tests {
             let expected = float.run(&real_state, goal, 4);
             let found = execute_decoder(float.quantize(fraction_bits as u8), state, goal).unwrap();
             for (found, expected) in found.iter().map(|w| w / 65536.0).zip(expected) {
-                // Input Q8 m, state down to Q11: millimeters.
+                // Input Q8 m, state down to Q12: below a few millimeters.
                 let error = (found - expected).abs();
-                assert!(error < 0.02, "{found} m for {expected} m, round {round_number}, seed {seed:#x}");
+                assert!(error < 0.003, "{found} m for {expected} m, round {round_number}, seed {seed:#x}");
             }
         }
     }
@@ -448,7 +448,7 @@ mod tests {
 
     #[test]
     fn opposite_halves_of_the_candidate_cancel_before_the_table() {
-        // i = 20.0 and r·j ≈ −19.0 lie beyond i16 Q12; their sum 1.0 does not.
+        // i = 20.0 and r·j ≈ −19.0 lie beyond i16 Q12; their sum 1.0 does not. r = 1 − 2^−15 costs up to 8 codes.
         let decoder = biased(1 << 20, -(1 << 20), 20 * 4096, -19 * 4096);
         let h = execute_decoder(decoder, vec![0.0], [0.0, 0.0]).unwrap()[0];
         assert!((h - 32768.0 * 1f64.tanh()).abs() < 12.0, "{h}");

@@ -92,7 +92,7 @@ pub(super) fn linear(
 /// Positions of one tile: enough to pay for a pass over the weights, few enough to feed every core. The result does not
 /// depend on it, all sums being exact.
 fn tile_rows(positions: usize) -> usize {
-    positions.div_ceil(2 * rayon::current_num_threads()).clamp(1, 256)
+    positions.div_ceil(rayon::current_num_threads()).clamp(1, 256)
 }
 
 /// Fills `positions × outputs` values tile by tile; `fill` gets the first position and the tile.

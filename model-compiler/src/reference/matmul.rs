@@ -4,6 +4,8 @@
 //! hold more outputs, never more summands. So any number of threads and any CPU give the same bits, and a calibration
 //! made on one machine is the calibration made on every other.
 
+use rayon::prelude::*;
+
 /// Outputs computed side by side (one AVX-512 vector, two of AVX2, four of SSE or NEON).
 const LANES: usize = 16;
 
@@ -11,7 +13,7 @@ const LANES: usize = 16;
 const TILE: usize = 6;
 
 /// Rows that one task computes; its patches stay in the second-level cache.
-pub(super) const ROWS_PER_TASK: usize = 48;
+pub(super) const ROWS_PER_TASK: usize = 24;
 
 /// Weights regrouped so that one step of the depth reads [`LANES`] neighboring outputs; missing outputs are zero.
 pub(super) struct Panels {
@@ -26,12 +28,13 @@ impl Panels {
     pub(super) fn new(weights: &[f32], outputs: usize) -> Self {
         let depth = weights.len() / outputs;
         let mut data = vec![[0.0; LANES]; outputs.div_ceil(LANES) * depth];
-        for (o, row) in weights.chunks_exact(depth).enumerate() {
-            let panel = &mut data[o / LANES * depth..][..depth];
-            for (lanes, &w) in panel.iter_mut().zip(row) {
-                lanes[o % LANES] = w;
+        data.par_chunks_mut(depth).zip(weights.par_chunks(LANES * depth)).for_each(|(panel, rows)| {
+            for (k, lanes) in panel.iter_mut().enumerate() {
+                for (lane, row) in lanes.iter_mut().zip(rows.chunks_exact(depth)) {
+                    *lane = row[k];
+                }
             }
-        }
+        });
         Self { outputs, depth, data }
     }
 

@@ -53,9 +53,9 @@ fn run<T: Code>(
                 Some(query) => widen(query, row.query),
                 None => widen(codes, row.query),
             }
-            row.score(key, channels, head);
+            row.score(key, heads, head);
             let sum = row.exponentiate(args, table);
-            row.mix(value, channels, head);
+            row.mix(value, heads, head);
             row.write(args, sum, codes);
         }
     }
@@ -81,9 +81,10 @@ impl<'a> RowScratch<'a> {
     }
 
     /// `a_j = Σ q·k_j`.
-    fn score(&mut self, key: &[i8], channels: usize, head: usize) {
-        for (logit, key) in self.keys.iter_mut().zip(key.chunks_exact(channels)) {
-            [*logit] = dot(block(key, head, self.query.len()).unwrap_or_default(), [&*self.query]);
+    fn score(&mut self, key: &[i8], heads: usize, head: usize) {
+        for (j, logit) in self.keys.iter_mut().enumerate() {
+            let key = block(key, j * heads + head, self.query.len()).unwrap_or_default();
+            [*logit] = dot(key, [&*self.query]);
         }
     }
 
@@ -106,11 +107,11 @@ impl<'a> RowScratch<'a> {
     }
 
     /// `A_t = Σ_j e_j·v_jt`.
-    fn mix(&mut self, value: &[i8], channels: usize, head: usize) {
+    fn mix(&mut self, value: &[i8], heads: usize, head: usize) {
         self.context.fill(0);
-        for (e, value) in self.keys.iter().zip(value.chunks_exact(channels)) {
+        for (j, e) in self.keys.iter().enumerate() {
             let e = saturate_i16(i64::from(*e));
-            let value = block(value, head, self.context.len()).unwrap_or_default();
+            let value = block(value, j * heads + head, self.context.len()).unwrap_or_default();
             for (sum, v) in self.context.iter_mut().zip(value) {
                 *sum = sum.wrapping_add(i32::from(e) * i32::from(*v));
             }
@@ -124,6 +125,156 @@ impl<'a> RowScratch<'a> {
         for (code, context) in codes.iter_mut().zip(&*self.context) {
             let t = round_shift(i64::from(*context).wrapping_mul(reciprocal), digits + 10);
             *code = args.requant.code(t);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use super::super::oracle::{Rng, Scratch, clamp, for_seeds, round};
+    use super::*;
+    use crate::kernels::RequantArgs;
+    use crate::kernels::plan::attention_scratch_bytes;
+    use crate::program::{Clamp, Requant};
+    use crate::tensor::ElementType;
+    use std::vec::Vec;
+
+    fn table() -> [i16; EXP_TABLE_LEN] {
+        core::array::from_fn(|k| f64::min(32767.0, (32768.0 * f64::exp2(-(k as f64) / 256.0)).round()) as i16)
+    }
+
+    fn expected(args: &AttentionArgs<'_>, query: &[i8], key: &[i8], value: &[i8]) -> Vec<i128> {
+        let (tokens, channels) = (args.tokens as usize, usize::from(args.channels));
+        let size = channels / usize::from(args.heads);
+        let at = |codes: &[i8], token: usize, channel: usize| i128::from(codes[token * channels + channel]);
+        let code = |element: usize| {
+            let (row, channel) = (element / channels, element % channels);
+            let head = channel / size * size..(channel / size + 1) * size;
+            let logit = |j: usize| head.clone().map(|c| at(query, row, c) * at(key, j, c)).sum::<i128>();
+            let a: Vec<i128> = (0..tokens).map(logit).collect();
+            let e = a.iter().map(|logit| {
+                let delta = a.iter().max().unwrap() - logit;
+                let u = round(delta * i128::from(args.exponent.multiplier), args.exponent.shift.into()).min(31 << 16);
+                let (i, k, r) = (u >> 16, ((u >> 8) & 255) as usize, u & 255);
+                let (t0, t1) = (i128::from(args.exp_table[k]), i128::from(args.exp_table[k + 1]));
+                round((t0 << 8) - (t0 - t1) * r, 8 + i.min(23) as u32)
+            });
+            let e: Vec<i128> = e.collect();
+            let s: i128 = e.iter().sum();
+            let c = s.ilog2() + 1;
+            let mixed: i128 = (0..tokens).map(|j| e[j] * at(value, j, channel)).sum();
+            let t = round(mixed * ((1 << (c + 22)) / s), c + 10);
+            let requant = args.requant.requant;
+            let y =
+                i128::from(args.requant.zero_point) + round(t * i128::from(requant.multiplier), requant.shift.into());
+            clamp(y, args.requant.clamp)
+        };
+        (0..tokens * channels).map(code).collect()
+    }
+
+    fn check(rng: &mut Rng, tokens: u32, heads: u16, size: u16) {
+        let channels = heads * size;
+        let count = tokens as usize * usize::from(channels);
+        let [query, key, value] = [(); 3].map(|()| rng.values::<i8>(count, -127, 127));
+        let to = rng.element_type();
+        let table = table();
+        let span = if to == ElementType::I8 { 7 } else { 15 };
+        let args = AttentionArgs {
+            tokens,
+            channels,
+            heads,
+            exponent: Requant { multiplier: rng.multiplier(), shift: rng.range(16, 28) as u8 },
+            exp_table: &table,
+            requant: RequantArgs {
+                input_zero_point: 0,
+                requant: rng.requant(19, span),
+                zero_point: rng.zero_point(to),
+                clamp: rng.clamp(to),
+            },
+        };
+        let expected = expected(&args, &query, &key, &value);
+        let mut scratch = Scratch::new(attention_scratch_bytes(tokens, channels, heads));
+        let mut output = rng.buffer(to, count);
+        attention(&args, Some(&query), &key, &value, output.codes_mut(), scratch.bytes());
+        output.assert_equals(&expected, "attention");
+        if to == ElementType::I8 {
+            let mut output = query.clone();
+            attention(&args, None, &key, &value, CodesMut::I8(&mut output), scratch.bytes());
+            assert!(output.iter().map(|y| i128::from(*y)).eq(expected), "in place");
+        }
+    }
+
+    #[test]
+    fn equals_the_formula_apart_and_in_place() {
+        for_seeds(300, |rng| {
+            let (tokens, heads, size) = (rng.range(1, 20) as u32, rng.range(1, 4) as u16, rng.range(1, 40) as u16);
+            check(rng, tokens, heads, size);
+        });
+    }
+
+    #[test]
+    fn equals_the_formula_at_the_largest_sizes() {
+        check(&mut Rng(1), 512, 1, 3);
+        check(&mut Rng(2), 3, 1, 512);
+    }
+
+    #[test]
+    fn equal_logits_average_the_values() {
+        let table = table();
+        let args = AttentionArgs {
+            tokens: 4,
+            channels: 1,
+            heads: 1,
+            exponent: Requant { multiplier: 1 << 23, shift: 20 },
+            exp_table: &table,
+            requant: RequantArgs {
+                input_zero_point: 0,
+                requant: Requant { multiplier: 1 << 23, shift: 23 + 12 },
+                zero_point: 0,
+                clamp: Clamp { min: -128, max: 127 },
+            },
+        };
+        let mut output = [0; 4];
+        let mut scratch = Scratch::new(attention_scratch_bytes(4, 1, 1));
+        attention(&args, Some(&[0; 4]), &[9; 4], &[10, 20, 30, -16], CodesMut::I8(&mut output), scratch.bytes());
+        assert_eq!(output, [11; 4]);
+    }
+
+    #[test]
+    fn hostile_constants_and_lengths_do_not_panic() {
+        for entry in [i16::MIN, -1, 0, i16::MAX] {
+            let table = [entry; EXP_TABLE_LEN];
+            let args = AttentionArgs {
+                tokens: 2,
+                channels: 3,
+                heads: 1,
+                exponent: Requant { multiplier: i32::MIN, shift: 255 },
+                exp_table: &table,
+                requant: RequantArgs {
+                    input_zero_point: i16::MIN,
+                    requant: Requant { multiplier: i32::MIN, shift: 0 },
+                    zero_point: i16::MIN,
+                    clamp: Clamp { min: 1, max: -1 },
+                },
+            };
+            let codes = [-128, 127, -128, 127, -128, 127];
+            for args in [
+                args,
+                AttentionArgs { exponent: Requant { multiplier: i32::MAX, shift: 0 }, ..args },
+                AttentionArgs { heads: 0, ..args },
+                AttentionArgs { heads: 2, ..args },
+                AttentionArgs { heads: 7, ..args },
+                AttentionArgs { channels: 0, ..args },
+                AttentionArgs { tokens: u32::MAX, ..args },
+                AttentionArgs { exp_table: &[], ..args },
+            ] {
+                let mut scratch = Scratch::new(256);
+                attention(&args, Some(&codes), &codes, &codes, CodesMut::I16(&mut [0; 6]), scratch.bytes());
+                attention(&args, None, &codes, &codes, CodesMut::I8(&mut [0; 6]), scratch.bytes());
+                attention(&args, None, &codes, &codes, CodesMut::I16(&mut [0; 6]), &mut []);
+                attention(&args, None, &codes, &[], CodesMut::I8(&mut [0; 6]), scratch.bytes());
+            }
         }
     }
 }

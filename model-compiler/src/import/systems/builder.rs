@@ -14,9 +14,6 @@ const EPSILON: f32 = 1e-5;
 const IMAGE_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
 const IMAGE_STD: [f32; 3] = [0.229, 0.224, 0.225];
 
-/// Largest count of a LiDAR histogram cell; the networks see counts divided by it.
-const BEV_MAX_COUNT: f32 = 5.0;
-
 pub(super) struct Builder<'a> {
     pub(super) graph: Graph,
     pub(super) tensors: NamedTensors,
@@ -67,11 +64,9 @@ impl<'a> Builder<'a> {
         self.push(format!("{module}.normalize"), Op::Normalize(Arc::new(normalization)), &[input])
     }
 
-    /// LiDAR histogram: counts, divided by their maximum.
-    pub(super) fn bev(&mut self, module: &str, (height, width): (u16, u16), channels: usize) -> Result<ValueId> {
-        let input = self.graph.push_input("bev", InputKind::Bev, Shape::map(height, width, channels as u16));
-        let normalization = Normalization { mean: vec![0.0; channels], std: vec![BEV_MAX_COUNT; channels] };
-        self.push(format!("{module}.normalize"), Op::Normalize(Arc::new(normalization)), &[input])
+    /// LiDAR histogram; the division of its counts belongs to the input's kind.
+    pub(super) fn bev(&mut self, (height, width): (u16, u16), channels: usize) -> ValueId {
+        self.graph.push_input("bev", InputKind::Bev, Shape::map(height, width, channels as u16))
     }
 
     /// Convolution without bias (`shape` is `[O, I, kh, kw]`), then batch norm.

@@ -19,7 +19,7 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);
     let rgb = b.rgb("image_encoder", resolution)?;
-    let bev = b.bev("lidar_encoder", resolution, channels)?;
+    let bev = b.bev(resolution, channels);
     let mut image = image_network.stem(b, rgb, 3)?;
     let mut lidar = lidar_network.stem(b, bev, channels)?;
     for stage in 1..=4 {

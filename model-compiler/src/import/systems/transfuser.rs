@@ -29,7 +29,7 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let scales = Transformer::detect_all(&b.tensors, &image_network.widths, grid);
 
     let rgb = b.rgb("encoder.image_encoder", resolution)?;
-    let bev = b.bev("encoder.lidar_encoder", resolution, channels)?;
+    let bev = b.bev(resolution, channels);
     let velocity = scales
         .iter()
         .any(Option::is_some)

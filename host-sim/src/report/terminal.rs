@@ -1,0 +1,144 @@
+//! The forms for people: tables with a line per frame or step, and a short summary.
+
+use super::{StepReport, VerifyReport};
+use crate::run::{FrameResult, RunReport};
+use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
+use std::fmt::Write;
+
+/// Waypoints of every frame.
+pub fn run(report: &RunReport) -> String {
+    let longest = report.frames.iter().map(|frame| frame.waypoints.len()).max().unwrap_or(0);
+    let header = ["frame".to_owned()]
+        .into_iter()
+        .chain((1..=longest).flat_map(|k| [format!("right {k}"), format!("forward {k}")]));
+    let row = |frame: &FrameResult| {
+        let meters = frame.waypoints.iter().flatten().map(|meters| format!("{meters:.3}"));
+        [frame.name.clone()].into_iter().chain(meters).collect()
+    };
+    let table = table(header.collect(), &[0], report.frames.iter().map(row));
+    format!("{} (sha256 {}…), waypoints in meters\n\n{table}\n", report.model.name, &report.model.sha256[..16])
+}
+
+/// The steps and the summary of a verification.
+pub fn verify(report: &VerifyReport) -> String {
+    let mut text = format!("{} for {}, {} frames\n\n", report.model.name, report.target, report.frames.len());
+    let header = [
+        "", "step", "op", "shape", "type", "scale", "local dB", "SQNR dB", "cosine", "max LSB", "clip ppm", "headroom",
+        "bytes", "equal",
+    ];
+    let rows = report.steps.iter().map(step_row);
+    let _ = writeln!(text, "{}\n", table(header.map(str::to_owned).to_vec(), &[1, 2, 3, 4], rows));
+    summary(&mut text, report);
+    text
+}
+
+fn step_row(step: &StepReport) -> Vec<String> {
+    let [height, width, channels] = step.shape;
+    vec![
+        step.position.to_string(),
+        step.step.clone(),
+        step.op.to_owned(),
+        format!("{height}×{width}×{channels}"),
+        step.element.to_owned(),
+        format!("{:.3e}", step.scale),
+        figure(step.local_sqnr_db, 1),
+        figure(step.sqnr_db, 1),
+        figure(step.cosine, 5),
+        figure(step.max_error_lsb, 2),
+        figure(step.saturation_ppm, 0),
+        step.headroom_bits.to_string(),
+        step.bytes.to_string(),
+        if step.bytes_equal { "yes" } else { "NO" }.to_owned(),
+    ]
+}
+
+fn summary(text: &mut String, report: &VerifyReport) {
+    let s = &report.summary;
+    let bytes = if report.bytes_equal { "equal in every step of every frame" } else { "UNEQUAL" };
+    let _ = writeln!(text, "engine and f64 model   {bytes} ({} steps, {} frames)", s.steps, report.frames.len());
+    if let (Some(step), Some(db)) = (&s.worst_step, s.worst_sqnr_db) {
+        let _ = writeln!(text, "worst step             {step}: {db:.1} dB");
+    }
+    for (k, error) in s.waypoint_error_mm.iter().enumerate() {
+        let _ = writeln!(
+            text,
+            "waypoint {}             {:.1} mm off on average, {:.1} mm at most",
+            k + 1,
+            error.mean,
+            error.max
+        );
+    }
+    let _ = writeln!(
+        text,
+        "arena                  {} B, lower bound {} B: {}",
+        s.arena_bytes,
+        s.arena_bound_bytes,
+        s.arena_status.words()
+    );
+    let _ = writeln!(text, "flash                  {} B", s.flash_bytes);
+}
+
+fn figure(value: Option<f64>, digits: usize) -> String {
+    match value {
+        None => "–".to_owned(),
+        Some(value) if value == f64::INFINITY => "exact".to_owned(),
+        Some(value) => format!("{value:.digits$}"),
+    }
+}
+
+/// A table whose columns are aligned right, except those of words.
+fn table(header: Vec<String>, words: &[usize], rows: impl Iterator<Item = Vec<String>>) -> String {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
+    table.set_header(header);
+    table.add_rows(rows);
+    for (index, column) in table.column_iter_mut().enumerate() {
+        column.set_cell_alignment(if words.contains(&index) { CellAlignment::Left } else { CellAlignment::Right });
+    }
+    table.trim_fmt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::run::ModelInfo;
+
+    #[test]
+    fn waypoints_stand_in_columns() {
+        let model = ModelInfo { name: "mini".into(), sha256: "ab".repeat(32) };
+        let frame = |name: &str, x: f64| FrameResult { name: name.into(), waypoints: vec![[x, 2.0], [-x, 14.25]] };
+        let text = run(&RunReport { schema: 1, model, frames: vec![frame("a", 0.5), frame("long name", -10.0)] });
+        let lines: Vec<&str> = text.lines().skip(2).collect();
+        assert_eq!(
+            lines[0].split_whitespace().collect::<Vec<_>>().join(" "),
+            "frame right 1 forward 1 right 2 forward 2"
+        );
+        assert!(lines[1].ends_with("14.250") && lines[2].ends_with("14.250"));
+        assert_eq!(lines[1].len(), lines[2].len(), "{text}");
+        assert!(text.starts_with("mini (sha256 abababababababab…)"));
+    }
+
+    #[test]
+    fn a_verification_shows_steps_and_summary() {
+        let text = verify(&super::super::tests::report());
+        for expected in [
+            "local dB",
+            "conv1",
+            "64×64×64",
+            "21.5",
+            "waypoint 1",
+            "1.2 mm off on average, 2.5 mm",
+            "lower bound 2048 B: optimal",
+        ] {
+            assert!(text.contains(expected), "{expected} in\n{text}");
+        }
+        assert!(text.contains("equal in every step"), "{text}");
+    }
+
+    #[test]
+    fn figures_that_are_missing_or_infinite_are_words() {
+        assert_eq!(figure(None, 1), "–");
+        assert_eq!(figure(Some(f64::INFINITY), 1), "exact");
+        assert_eq!(figure(Some(12.345), 2), "12.35");
+    }
+}

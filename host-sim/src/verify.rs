@@ -1,0 +1,325 @@
+//! Proof and measure of an image: its bytes against the f64 model, its numbers against the f32 network.
+
+use crate::codes;
+use crate::files::{self, FrameSource, ImageFile};
+use crate::report::{FrameReport, StepReport, Summary, VerifyReport, WaypointError, worst};
+use crate::run::{ModelInfo, Waypoints, waypoints};
+use crate::statistics::Spread;
+use crate::trace::{FrameTrace, StepFigures, Tracer};
+use firmware::image::Image;
+use firmware::tensor::ElementType;
+use indicatif::ProgressBar;
+use model_compiler::artifact;
+use model_compiler::error::{Error, ErrorCode, Result};
+use model_compiler::frames::{self, Frame, FrameFormat};
+use model_compiler::import::ImportOptions;
+use model_compiler::ir::Graph;
+use model_compiler::qmodel::QModel;
+use model_compiler::record::Record;
+use std::path::PathBuf;
+
+/// What to verify.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// The image.
+    pub image: PathBuf,
+    /// Its build record; beside the image if not given.
+    pub record: Option<PathBuf>,
+    /// The checkpoint that it was compiled from; without it only bytes are compared.
+    pub model: Option<PathBuf>,
+    /// How the checkpoint is read.
+    pub import: ImportOptions,
+    /// Frames to run.
+    pub frames: FrameSource,
+    /// Also run the mirror image of every frame.
+    pub mirror: bool,
+    /// Fail where a step's accumulated SQNR is below this, dB.
+    pub min_sqnr_db: Option<f64>,
+}
+
+/// Runs the comparison. Unequal bytes and missed gates are in the report ([`VerifyReport::failure`]), not errors.
+///
+/// # Errors
+/// A file cannot be read, the files do not belong together, or the engine refuses or leaves its arena.
+pub fn verify(options: &Options, progress: &ProgressBar) -> Result<VerifyReport> {
+    let file = ImageFile::read(&options.image)?;
+    let image = file.parse()?;
+    let record = file.record(options.record.as_deref())?;
+    let graph = options.model.as_deref().map(|path| files::load_graph(path, &options.import)).transpose()?;
+    let mut frames = options.frames.load(&FrameFormat::of_model(&record.model))?;
+    if options.mirror {
+        frames.extend(frames.iter().map(Frame::mirrored).collect::<Vec<_>>());
+    }
+    if options.min_sqnr_db.is_some() && graph.is_none() {
+        let error = Error::new(ErrorCode::Usage, "--min-sqnr", "needs the f32 network to compare with");
+        return Err(error.with_help("add --model MODEL"));
+    }
+    let sources = Sources { image, record: &record, graph: graph.as_ref() };
+    let model = ModelInfo { name: record.model.name.clone(), sha256: artifact::hex(&file.sha256()) };
+    let mut report = compare(&sources, &frames, model, progress)?;
+    report.summary.flash_bytes = file.flash_bytes();
+    report.check(options.min_sqnr_db);
+    Ok(report)
+}
+
+/// Everything that takes part, loaded.
+#[derive(Clone, Copy, Debug)]
+pub struct Sources<'a> {
+    /// The image.
+    pub image: Image<'a>,
+    /// Its record.
+    pub record: &'a Record,
+    /// The f32 network.
+    pub graph: Option<&'a Graph>,
+}
+
+/// Traces frames up to the first with unequal bytes and sums up.
+///
+/// # Errors
+/// See [`Tracer::new`] and [`Tracer::trace`].
+pub fn compare(
+    sources: &Sources<'_>,
+    frames: &[Frame],
+    model: ModelInfo,
+    progress: &ProgressBar,
+) -> Result<VerifyReport> {
+    let record = sources.record;
+    let mut tracer = Tracer::new(sources.image, record, sources.graph)?;
+    progress.set_length(tracer.units_per_frame() * frames.len() as u64);
+    let known = calibration_digests(&record.model);
+    let overlap = frames::overlap(&known, frames);
+    let mut waypoint_errors = Vec::new();
+    let mut first_difference = None;
+    let mut frame_reports = Vec::new();
+    for frame in frames {
+        progress.set_message(frame.name.clone());
+        let trace = tracer.trace(frame, progress)?;
+        let report = frame_report(&record.model, frame, &trace, overlap.contains(&frame.name.as_str()));
+        add_waypoint_errors(&mut waypoint_errors, &report);
+        frame_reports.push(report);
+        first_difference = trace.difference;
+        if first_difference.is_some() {
+            break;
+        }
+    }
+    progress.finish_and_clear();
+    let steps = step_reports(record, tracer.figures());
+    Ok(VerifyReport {
+        schema: 1,
+        model,
+        target: record.target.clone(),
+        passed: true,
+        bytes_equal: first_difference.is_none(),
+        first_difference,
+        summary: summary(record, &steps, &waypoint_errors),
+        steps,
+        calibration_frames: overlap.into_iter().map(str::to_owned).collect(),
+        frames: frame_reports,
+        failure: None,
+    })
+}
+
+fn calibration_digests(model: &QModel) -> Vec<&str> {
+    let digests = model.provenance.iter().find(|(key, _)| key == "calibration_frames");
+    digests.map(|(_, digests)| digests.split(',').map(str::trim).collect()).unwrap_or_default()
+}
+
+fn frame_report(model: &QModel, frame: &Frame, trace: &FrameTrace, calibration: bool) -> FrameReport {
+    let is_waypoints = |port: &model_compiler::qmodel::Port| {
+        let tensor = model.tensor(port.tensor);
+        tensor.element == ElementType::I32 && tensor.shape.channels == 2
+    };
+    let output = model.outputs.iter().position(is_waypoints);
+    let reference = trace.reference_outputs.as_ref();
+    FrameReport {
+        name: frame.name.clone(),
+        digest: frame.short_digest(),
+        calibration,
+        dropped_points: frame.dropped_points,
+        waypoints: output.map(|i| waypoints(&trace.outputs[i])),
+        reference_waypoints: output.and_then(|i| Some(waypoints(&reference?[i]))),
+    }
+}
+
+fn add_waypoint_errors(errors: &mut Vec<Spread>, frame: &FrameReport) {
+    let (Some(found), Some(expected)) = (&frame.waypoints, &frame.reference_waypoints) else { return };
+    errors.resize(found.len(), Spread::default());
+    for (spread, millimeters) in errors.iter_mut().zip(distances_mm(found, expected)) {
+        spread.add(millimeters);
+    }
+}
+
+fn distances_mm(found: &Waypoints, expected: &Waypoints) -> Vec<f64> {
+    let distance = |(f, e): (&[f64; 2], &[f64; 2])| 1000.0 * (f[0] - e[0]).hypot(f[1] - e[1]);
+    found.iter().zip(expected).map(distance).collect()
+}
+
+fn step_reports(record: &Record, figures: &[StepFigures]) -> Vec<StepReport> {
+    let steps = record.plan.order.iter().map(|&step| &record.model.steps[step as usize]);
+    let report = |(position, (step, figures)): (usize, (&model_compiler::qmodel::QStep, &StepFigures))| {
+        let tensor = record.model.tensor(step.op.output());
+        let elements = tensor.shape.elements();
+        StepReport {
+            position,
+            step: step.name.clone(),
+            op: step.op.name(),
+            tensor: tensor.name.clone(),
+            shape: [tensor.shape.height, tensor.shape.width, tensor.shape.channels],
+            element: codes::element_name(tensor.element),
+            scale: tensor.scale,
+            zero_point: tensor.zero_point,
+            local_sqnr_db: figures.local.map(|sums| sums.sqnr_db()),
+            sqnr_db: figures.accumulated.map(|sums| sums.sqnr_db()),
+            cosine: figures.accumulated.map(|sums| sums.cosine()),
+            max_error_lsb: figures.local.map(|sums| sums.largest_error() / tensor.scale),
+            saturation_ppm: figures.saturated.map(|n| 1e6 * n as f64 / figures.codes.max(1) as f64),
+            headroom_bits: step.bounds.headroom_bits,
+            bytes: elements * u64::from(tensor.element.bytes()),
+            bytes_equal: figures.equal,
+        }
+    };
+    steps.zip(figures).enumerate().map(report).collect()
+}
+
+fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread]) -> Summary {
+    let plan = &record.plan;
+    Summary {
+        steps: steps.len(),
+        worst_step: worst(steps).map(|step| step.step.clone()),
+        worst_sqnr_db: worst(steps).and_then(|step| step.sqnr_db),
+        waypoint_error_mm: waypoint_errors.iter().map(|s| WaypointError { mean: s.mean(), max: s.max() }).collect(),
+        arena_bytes: plan.arena_bytes,
+        arena_bound_bytes: plan.bound_bytes,
+        arena_status: plan.status,
+        flash_bytes: 0,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::{Sample, frame, graph, sample};
+    use std::fs;
+
+    fn info() -> ModelInfo {
+        ModelInfo { name: "sample".into(), sha256: String::new() }
+    }
+
+    fn compare_sample(sample: &Sample, graph: Option<&Graph>, frames: &[Frame]) -> Result<VerifyReport> {
+        let image = Image::parse(&sample.image).expect("the sample is a valid image");
+        compare(&Sources { image, record: &sample.record, graph }, frames, info(), &ProgressBar::hidden())
+    }
+
+    #[test]
+    fn engine_f64_model_and_f32_network_agree_on_the_sample() {
+        let report = compare_sample(&sample(), Some(&graph()), &[frame(0), frame(1), frame(2)]).unwrap();
+        assert!(report.bytes_equal && report.first_difference.is_none());
+        assert_eq!(report.frames.len(), 3);
+        assert_eq!(report.calibration_frames, ["frame 1"]);
+        // All values are exact: codes are whole grey levels, means whole quarters.
+        for step in &report.steps {
+            assert_eq!((step.local_sqnr_db, step.sqnr_db), (Some(f64::INFINITY), Some(f64::INFINITY)), "{}", step.step);
+        }
+        assert_eq!((report.steps[1].op, report.steps[1].element, report.steps[1].bytes), ("average_pool", "i16", 6));
+        assert_eq!(report.steps[0].saturation_ppm, None);
+        assert_eq!(report.steps[1].saturation_ppm, Some(0.0));
+    }
+
+    #[test]
+    fn a_record_of_other_integers_is_found_at_its_first_step() {
+        let mut sample = sample();
+        if let model_compiler::qmodel::QOp::AveragePool { requant, .. } = &mut sample.record.model.steps[1].op {
+            requant.multiplier += 1 << 12;
+        }
+        let report = compare_sample(&sample, None, &[frame(0), frame(1)]).unwrap();
+        let difference = report.first_difference.expect("the multiplier differs");
+        assert_eq!((difference.position, difference.step.as_str(), difference.tensor.as_str()), (1, "mean", "mean"));
+        assert_ne!(difference.found, difference.expected);
+        assert_eq!(report.frames.len(), 1, "later frames are not run");
+        assert!(report.steps[0].bytes_equal && !report.steps[1].bytes_equal);
+    }
+
+    #[test]
+    fn noise_of_one_step_is_told_apart_from_what_adds_up() {
+        // A network whose first pool is something else: the second step is exact by itself, its value is not.
+        let mut other = graph();
+        if let model_compiler::ir::Op::MaxPool(window) = &other.nodes[1].op {
+            other.nodes[1].op = model_compiler::ir::Op::AveragePool(*window);
+        }
+        let report = compare_sample(&sample(), Some(&other), &[frame(3)]).unwrap();
+        assert!(report.steps[0].local_sqnr_db.unwrap() < 40.0);
+        assert_eq!(report.steps[1].local_sqnr_db, Some(f64::INFINITY));
+        assert!(report.steps[1].sqnr_db.unwrap() < 40.0);
+        assert!(report.steps[0].max_error_lsb.unwrap() > 1.0);
+    }
+
+    #[test]
+    fn files_that_do_not_belong_together_are_refused() {
+        let mut other = graph();
+        other.nodes[1].name = "elsewhere".into();
+        other.values[1].name = "elsewhere".into();
+        let error = compare_sample(&sample(), Some(&other), &[frame(0)]).unwrap_err();
+        assert!(error.to_string().contains("it has no value pool"), "{error}");
+        let mut bigger = sample();
+        bigger.record.plan.arena_bytes += 16;
+        let error = compare_sample(&bigger, None, &[frame(0)]).unwrap_err();
+        assert_eq!(error.message, "the image has 80 bytes of arena, the record 96");
+        let blind = Frame { rgb: None, ..frame(0) };
+        assert_eq!(compare_sample(&sample(), None, &[blind]).unwrap_err().code, ErrorCode::Frames);
+    }
+
+    /// Image, record and frames as files.
+    fn files(sample: &Sample) -> (tempfile::TempDir, Options) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = |name: &str| folder.path().join(name);
+        fs::write(path("sample.img"), &*sample.image).unwrap();
+        fs::write(path("sample.record"), artifact::to_bytes(&sample.record).unwrap()).unwrap();
+        let pixels: Vec<u8> = (0..2 * 48).collect();
+        let rgb = safetensors::tensor::TensorView::new(safetensors::Dtype::U8, vec![2, 3, 4, 4], &pixels).unwrap();
+        fs::write(path("inputs.safetensors"), safetensors::serialize([("rgb", rgb)], None).unwrap()).unwrap();
+        let options = Options {
+            image: path("sample.img"),
+            record: None,
+            model: None,
+            import: ImportOptions::default(),
+            frames: FrameSource { frames: None, inputs: Some(path("inputs.safetensors")) },
+            mirror: false,
+            min_sqnr_db: None,
+        };
+        (folder, options)
+    }
+
+    #[test]
+    fn files_are_verified_with_their_mirror_images() {
+        let (_folder, mut options) = files(&sample());
+        let report = verify(&options, &ProgressBar::hidden()).unwrap();
+        assert!(report.passed);
+        assert_eq!((report.frames.len(), report.summary.flash_bytes), (2, sample().image.len() as u64));
+        options.mirror = true;
+        let report = verify(&options, &ProgressBar::hidden()).unwrap();
+        assert_eq!(report.frames[3].name, "inputs#1 (mirrored)");
+        options.min_sqnr_db = Some(10.0);
+        let error = verify(&options, &ProgressBar::hidden()).unwrap_err();
+        assert_eq!((error.code, error.help.as_str()), (ErrorCode::Usage, "add --model MODEL"));
+    }
+
+    #[test]
+    fn a_record_of_another_build_is_refused() {
+        let mut sample = sample();
+        sample.record.image_sha256[0] ^= 1;
+        let (folder, options) = files(&sample);
+        let error = verify(&options, &ProgressBar::hidden()).unwrap_err();
+        assert!(error.message.contains("the record belongs to another image"), "{error}");
+        fs::remove_file(folder.path().join("sample.record")).unwrap();
+        let error = verify(&options, &ProgressBar::hidden()).unwrap_err();
+        assert!(error.location.ends_with("sample.record") && error.help.contains("--record"), "{error}");
+    }
+
+    #[test]
+    fn a_file_that_is_no_image_is_refused() {
+        let (folder, options) = files(&sample());
+        fs::write(folder.path().join("sample.img"), b"PK\x03\x04").unwrap();
+        let error = verify(&options, &ProgressBar::hidden()).unwrap_err();
+        assert!(error.to_string().contains("this is no model image"), "{error}");
+    }
+}
