@@ -184,7 +184,7 @@ fn table_changes() -> Vec<(Check, Change)> {
         (Check::TensorBytes, Parts(|p| record(p, ids::RGB).bytes -= 1)),
         (Check::TensorBytes, Parts(|p| record(p, ids::STREAM).bytes += 16)),
         (Check::TensorBytes, Parts(|p| scratch_record(p).bytes = 0)),
-        (Check::TensorAlignment, Parts(|p| record(p, ids::RGB).offset += 8)),
+        (Check::TensorAlignment, Parts(|p| record(p, ids::RGB).offset += 2)),
         (Check::TensorInside, Parts(|p| record(p, ids::KEY).offset = p.arena_bytes)),
         (Check::TensorInside, Parts(|p| record(p, ids::KEY).offset = 0xFFFF_FFF0)),
         (Check::TensorLive, Parts(|p| record(p, ids::KEY).last_step = STEPS as u16)),
