@@ -332,13 +332,13 @@ fn checked_plan(title: &str, model: &QModel, options: &PlanOptions) -> MemoryPla
 }
 
 #[test]
-fn transfuser_fits_into_1400_kib() {
+fn transfuser_fits_into_1_4_mib() {
     let model = transfuser(ElementType::I8);
     let plan = checked_plan("i8 maps", &model, &PlanOptions::default());
     assert_eq!(plan.status, PlanStatus::Optimal);
     // The second stem's input and output beside the first branch's pooled map; the rest is scratch.
     assert!(plan.arena_bytes > 128 * KIB + MIB + 256 * KIB);
-    assert!(plan.arena_bytes <= 1400 * KIB, "{}", plan.arena_bytes);
+    assert!(5 * plan.arena_bytes <= 7 * MIB, "{}", plan.arena_bytes);
 }
 
 #[test]
@@ -369,7 +369,7 @@ fn every_alignment_is_planned_to_the_bound() {
     for alignment in [4, 16, 64] {
         let plan = checked_plan("aligned", &model, &PlanOptions { alignment, ..PlanOptions::default() });
         assert_eq!(plan.status, PlanStatus::Optimal, "alignment {alignment}");
-        assert!(plan.tensors.iter().all(|p| p.offset % u64::from(alignment) == 0));
+        assert!(plan.tensors.iter().all(|p| p.offset.is_multiple_of(u64::from(alignment))));
     }
     let odd = PlanOptions { alignment: 12, ..PlanOptions::default() };
     assert_eq!(plan(&model, &portable(), &odd).unwrap_err().code, ErrorCode::Usage);
@@ -395,6 +395,8 @@ fn same_input_same_plan() {
     assert_eq!(make(), make());
 }
 
+type Sabotage<'a> = &'a dyn Fn(&mut MemoryPlan);
+
 #[test]
 fn checker_catches_sabotage() {
     let model = transfuser(ElementType::I8);
@@ -403,7 +405,7 @@ fn checker_catches_sabotage() {
     let taker = id("image.layer1.0.conv2");
     let stem = id("lidar.stem");
     let conv = good.scratch.iter().position(Option::is_some).unwrap();
-    let cases: [(&str, &dyn Fn(&mut MemoryPlan)); 14] = [
+    let cases: [(&str, Sabotage<'_>); 14] = [
         ("overlap", &|p| p.tensors[stem].offset = p.tensors[id("bev")].offset),
         ("outside the arena", &|p| p.tensors[stem].offset = p.arena_bytes - 4),
         ("is not a multiple", &|p| p.tensors[stem].offset += 2),
@@ -429,7 +431,7 @@ fn checker_catches_sabotage() {
 
 #[test]
 fn an_operand_that_is_needed_later_is_not_overwritten() {
-    // x is added to itself once shifted, then read again: nothing may lie over it.
+    // `kept` is read twice by one step, and x is read again at the end: neither may be overwritten there.
     let mut b = Builder::new("sums", ElementType::I8);
     let shape = Shape::map(8, 8, 4);
     let x = b.input("x", shape, ElementType::I8);

@@ -32,7 +32,7 @@ pub fn round_shift(value: i64, shift: u32) -> i64 {
 #[inline]
 fn round_last(value: i64, shift: u32) -> i64 {
     if fault::active(Fault::DoubleRounding) {
-        let first = shift / 2;
+        let first = shift.saturating_sub(1);
         return round_shift(round_shift(value, first), shift - first);
     }
     round_shift(value, shift)

@@ -59,6 +59,7 @@ pub fn variants() -> Vec<Variant> {
 #[derive(Debug)]
 pub struct Bench<'a> {
     graph: Graph,
+    calibration: Vec<Vec<Vec<f32>>>,
     statistics: Statistics,
     evaluation: &'a [Frame],
     /// Per frame: the pooled vector and the waypoints.
@@ -72,7 +73,8 @@ impl<'a> Bench<'a> {
     /// No pooled vector in the graph, or frames that it does not accept.
     pub fn new(graph: Graph, calibration: &[Frame], evaluation: &'a [Frame]) -> Result<Self> {
         let vector = vector_name(&graph)?.to_owned();
-        let statistics = calibrate(&graph, &pipeline::raw_inputs(&graph, calibration)?, |_, _| {})?;
+        let calibration = pipeline::raw_inputs(&graph, calibration)?;
+        let statistics = calibrate(&graph, &calibration, |_, _| {})?;
         let mut expected = Vec::with_capacity(evaluation.len());
         for inputs in pipeline::raw_inputs(&graph, evaluation)? {
             let mut seen = Vec::new();
@@ -83,7 +85,7 @@ impl<'a> Bench<'a> {
             })?;
             expected.push([seen, outputs.into_iter().next().unwrap_or_default()]);
         }
-        Ok(Self { graph, statistics, evaluation, expected })
+        Ok(Self { graph, calibration, statistics, evaluation, expected })
     }
 
     /// Quantizes with these choices and evaluates. `progress` is called after each frame with the number done.
@@ -91,7 +93,7 @@ impl<'a> Bench<'a> {
     /// # Errors
     /// The quantizer refuses the choices.
     pub fn measure(&self, options: &QuantizeOptions, mut progress: impl FnMut(usize)) -> Result<Fidelity> {
-        let model = quantize(&self.graph, &self.statistics, options)?;
+        let model = quantize(&self.graph, &self.calibration, &self.statistics, options)?;
         let mut sums = Sums::default();
         for (index, (frame, expected)) in self.evaluation.iter().zip(&self.expected).enumerate() {
             let [vector, waypoints] = self.integers(&model, frame)?;

@@ -138,3 +138,40 @@ pub fn calibrate(
     }
     Ok(Statistics { values })
 }
+
+/// Mean per channel of the values that quantized activations stand for: what clipping and rounding leave of each mean.
+/// `rounded` gives the nearest representable value; `None` leaves a value's float mean.
+///
+/// # Errors
+/// As [`calibrate`].
+pub fn quantized_means(
+    graph: &Graph,
+    frames: &[Vec<Vec<f32>>],
+    statistics: &Statistics,
+    rounded: impl Fn(ValueId, f64) -> Option<f64>,
+) -> Result<Vec<Vec<f64>>> {
+    let mut means: Vec<Vec<f64>> = statistics.values.iter().map(|v| v.channel_mean.clone()).collect();
+    let is_rounded: Vec<bool> = (0..means.len()).map(|i| rounded(ValueId(i as u32), 0.0).is_some()).collect();
+    for (mean, _) in means.iter_mut().zip(&is_rounded).filter(|(_, rounded)| **rounded) {
+        mean.fill(0.0);
+    }
+    for frame in frames {
+        reference::run(graph, frame, |node, data| {
+            let index = node.output.0 as usize;
+            if !is_rounded[index] {
+                return;
+            }
+            let sums = &mut means[index];
+            for position in data.chunks_exact(sums.len()) {
+                for (&x, sum) in position.iter().zip(sums.iter_mut()) {
+                    *sum += rounded(node.output, f64::from(x)).unwrap_or(0.0);
+                }
+            }
+        })?;
+    }
+    for (index, mean) in means.iter_mut().enumerate().filter(|(index, _)| is_rounded[*index]) {
+        let per_channel = (statistics.values[index].count as f64 / mean.len() as f64).max(1.0);
+        mean.iter_mut().for_each(|m| *m /= per_channel);
+    }
+    Ok(means)
+}

@@ -1,6 +1,6 @@
 //! Static memory plan: an offset in the arena for every tensor and scratch buffer, with a proof of how good it is.
 //!
-//! Items are chains of tensors that take over each other's memory ([`in_place`]), and one scratch buffer per step. A chain
+//! Items are chains of tensors that take over each other's memory, and one scratch buffer per step. A chain
 //! keeps one offset; at each step it is as large as its largest member live there, so a map that is pooled in place
 //! gives its tail back. A tensor is live from the step that writes it (inputs: from the start) to the last that reads it
 //! (outputs: to the end). No plan can be smaller than the largest sum of live bytes; the solver stops when it gets there,
@@ -93,7 +93,7 @@ pub struct PlanOptions {
     pub in_place_pooling: bool,
     /// Let sums and attention write over an operand.
     pub in_place: bool,
-    /// Limit of search nodes, for operator order and placement each.
+    /// Limit of search nodes of the placement; the order search stops there too, at the latest after 250 000.
     pub node_limit: u64,
     /// Look for the order with the least bound; otherwise the model's own order is kept.
     pub search_order: bool,
@@ -114,6 +114,9 @@ impl PlanOptions {
     }
 }
 
+/// Limit of nodes of the order search, which keeps a set of finished steps per node.
+const MAX_ORDER_NODES: u64 = 250_000;
+
 /// Largest number of in-place pairs that are tried without, where a plan with all of them misses the bound.
 const MAX_DROPPED_PAIRS: usize = 16;
 
@@ -128,7 +131,8 @@ pub fn plan(model: &QModel, target: &Target, options: &PlanOptions) -> Result<Me
         return Err(Error::new(ErrorCode::Usage, "alignment", message));
     }
     let needs = Needs::of(model, target, options)?;
-    let schedule = schedule::search(&needs, if options.search_order { options.node_limit } else { 0 });
+    let order_nodes = if options.search_order { options.node_limit.min(MAX_ORDER_NODES) } else { 0 };
+    let schedule = schedule::search(&needs, order_nodes);
     let ranges = needs.live_ranges(&schedule.order);
     let pairs = needs.pairs(&schedule.order, &ranges);
     let (pairs, items, packing) = best_pairs(&needs, &schedule.order, &ranges, pairs, options.node_limit);
@@ -147,13 +151,13 @@ pub fn plan(model: &QModel, target: &Target, options: &PlanOptions) -> Result<Me
 
 /// First and last position of a tensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-struct LiveRange {
-    first: u32,
-    last: u32,
+pub(crate) struct LiveRange {
+    pub first: u32,
+    pub last: u32,
 }
 
 /// An in-place choice per tensor: the tensor it takes over.
-type Pairs = Vec<Option<usize>>;
+pub(crate) type Pairs = Vec<Option<usize>>;
 
 /// Items with their meaning: the tensors of a chain, or the scratch of a position.
 struct Items {
@@ -164,7 +168,8 @@ struct Items {
     of_scratch: Vec<Option<usize>>,
 }
 
-/// All pairs, or one fewer where that makes a smaller arena (a chain is harder to place than its parts).
+/// All pairs, or one fewer where that makes a smaller arena: the bound is least with all of them, but a chain is harder
+/// to place than its parts. Chains live at the peak are tried first.
 fn best_pairs(
     needs: &Needs,
     order: &[usize],
@@ -175,7 +180,12 @@ fn best_pairs(
     let items = items(needs, order, ranges, &all);
     let packing = solver::pack(&items.shapes, node_limit);
     let mut nodes = packing.nodes;
-    let taken: Vec<usize> = (0..all.len()).filter(|&t| all[t].is_some()).collect();
+    let at_peak = |t: &usize| {
+        let spans = &items.shapes[items.of_tensor[*t]].spans;
+        spans.iter().any(|s| (s.first..=s.last).contains(&packing.peak_step))
+    };
+    let mut taken: Vec<usize> = (0..all.len()).filter(|&t| all[t].is_some()).collect();
+    taken.sort_by_key(|t| !at_peak(t));
     let mut best = (all.clone(), items, packing);
     for &tensor in taken.iter().take(MAX_DROPPED_PAIRS) {
         if best.2.peak == best.2.bound {

@@ -53,7 +53,7 @@ pub fn quantize_graph(
     let inputs = raw_inputs(graph, calibration)?;
     let statistics = calibrate(graph, &inputs, |done, total| progress("calibrate", done, total))?;
     progress("quantize", 0, 1);
-    let mut model = quantize(graph, &statistics, options)?;
+    let mut model = quantize(graph, &inputs, &statistics, options)?;
     progress("quantize", 1, 1);
     let digests: Vec<String> = calibration.iter().map(Frame::short_digest).collect();
     model.provenance = vec![

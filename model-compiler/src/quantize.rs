@@ -4,7 +4,7 @@
 //! real weights into integers ([`weighted`], [`sums`], [`token`], [`decoder`]); the interval analysis refuses whatever
 //! could leave its type or exceed 2^53. Formulas follow the numerics page, section by section.
 
-use crate::calibrate::Statistics;
+use crate::calibrate::{self, Statistics};
 use crate::error::{Error, ErrorCode, Result};
 use crate::ir::{Graph, Node, Op, ValueId};
 use crate::qmodel::{Bounds, Port, QModel, QOp, QStep, QTensor, QTensorId};
@@ -91,15 +91,25 @@ impl Default for QuantizeOptions {
     }
 }
 
-/// Quantizes an optimized graph.
+/// Quantizes an optimized graph with the statistics of its calibration frames (raw inputs per frame, in graph order).
 ///
 /// # Errors
 /// An operator without an integer form, or an intermediate that exceeds its type or 2^53; the node is named.
-pub fn quantize(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions) -> Result<QModel> {
+pub fn quantize(
+    graph: &Graph,
+    frames: &[Vec<Vec<f32>>],
+    statistics: &Statistics,
+    options: &QuantizeOptions,
+) -> Result<QModel> {
     let types = types::assign(graph, statistics, options)?;
+    let quantized_means = calibrate::quantized_means(graph, frames, statistics, |value, x| {
+        let stored = types.narrow(value);
+        (options.bias_correction && stored.element == ElementType::I8).then(|| stored.rounded(x))
+    })?;
     let mut builder = Builder {
         graph,
         statistics,
+        quantized_means,
         options,
         types,
         model: QModel {
@@ -128,6 +138,8 @@ pub fn quantize(graph: &Graph, statistics: &Statistics, options: &QuantizeOption
 struct Builder<'a> {
     graph: &'a Graph,
     statistics: &'a Statistics,
+    /// Mean per channel of each value as the layers read it.
+    quantized_means: Vec<Vec<f64>>,
     options: &'a QuantizeOptions,
     types: types::Types,
     model: QModel,
@@ -204,16 +216,16 @@ impl Builder<'_> {
         if let Some(&id) = self.narrowed.get(&value) {
             return Ok(id);
         }
-        let range = ranges::affine_i8(self.statistics.of(value), self.options.ranges);
+        let stored = *self.types.narrow(value);
         let name = format!("{}.i8", self.graph.value(value).name);
-        let id = self.add_tensor(name.clone(), value, types::Stored::i8(range));
-        let requant = factors::requant(self.scale(wide) / range.scale)?;
+        let id = self.add_tensor(name.clone(), value, stored);
+        let requant = factors::requant(self.scale(wide) / stored.scale)?;
         let op = QOp::Requantize {
             input: wide,
             output: id,
             input_zero_point: 0,
             requant,
-            zero_point: range.zero_point as i16,
+            zero_point: stored.zero_point as i16,
             clamp: Clamp { min: -128, max: 127 },
         };
         let bounds = bounds_of(factors::bits(32768.0), &[32768.0 * f64::from(requant.multiplier)], 0.0);

@@ -162,3 +162,97 @@ impl<'a> State<'a> {
         fitting
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A seeded network of up to 7 steps over two inputs; what nobody reads is an output.
+    fn random_needs(seed: u64) -> MemoryNeeds {
+        let mut state = seed;
+        let mut below = |n: usize| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 33) as usize % n
+        };
+        let steps = 3 + below(5);
+        let tensors = steps + 2;
+        let bytes: Vec<u64> = (0..tensors).map(|_| 4 * (1 + below(9) as u64)).collect();
+        let mut reads = Vec::new();
+        for step in 0..steps {
+            let mut read = vec![below(step + 2), below(step + 2)];
+            read.sort_unstable();
+            read.dedup();
+            reads.push(read);
+        }
+        let fits = |step: usize, t: &usize| bytes[*t] >= bytes[step + 2];
+        let overwritable = (0..steps).map(|s| reads[s].iter().copied().filter(|t| fits(s, t)).take(1).collect());
+        MemoryNeeds {
+            exact_bytes: bytes.clone(),
+            tensor_bytes: bytes.clone(),
+            is_output: (0..tensors).map(|t| !reads.iter().flatten().any(|&r| r == t)).collect(),
+            is_input: (0..tensors).map(|t| t < 2).collect(),
+            overwritable: overwritable.collect(),
+            writes: (2..tensors).collect(),
+            scratch: (0..steps).map(|_| 16 * below(2) as u64).collect(),
+            reads,
+            alignment: 16,
+        }
+    }
+
+    /// Peak from live ranges, not from the search's running sums.
+    fn peak_by_ranges(needs: &MemoryNeeds, order: &[usize]) -> u64 {
+        let ranges = needs.live_ranges(order);
+        let pairs = needs.pairs(order, &ranges);
+        let live_sum = |position: usize| {
+            let at = position as u32;
+            let tensors = (0..ranges.len()).filter(|&t| (ranges[t].first..=ranges[t].last).contains(&at));
+            let counted = tensors.filter(|&t| pairs[t].is_none() || ranges[t].first != at);
+            counted.map(|t| needs.tensor_bytes[t]).sum::<u64>() + needs.scratch_room(order[position])
+        };
+        (0..order.len()).map(live_sum).max().unwrap_or(0)
+    }
+
+    fn least_peak(needs: &MemoryNeeds, order: &mut Vec<usize>) -> u64 {
+        if order.len() == needs.writes.len() {
+            return peak_by_ranges(needs, order);
+        }
+        let mut best = u64::MAX;
+        for step in 0..needs.writes.len() {
+            let ready = |t: &usize| needs.is_input[*t] || order.iter().any(|&s| needs.writes[s] == *t);
+            if !order.contains(&step) && needs.reads[step].iter().all(ready) {
+                order.push(step);
+                best = best.min(least_peak(needs, order));
+                order.pop();
+            }
+        }
+        best
+    }
+
+    #[test]
+    fn finds_the_least_peak_of_all_orders() {
+        let mut improved = 0;
+        for seed in 0..400 {
+            let needs = random_needs(seed);
+            let own = search(&needs, 0);
+            assert!(own.order.iter().copied().eq(0..needs.writes.len()), "seed {seed}");
+            assert_eq!(own.peak, peak_by_ranges(&needs, &own.order), "seed {seed}");
+            let found = search(&needs, 1_000_000);
+            assert_eq!(found.peak, peak_by_ranges(&needs, &found.order), "seed {seed}");
+            assert_eq!(found.peak, least_peak(&needs, &mut Vec::new()), "seed {seed}: {needs:?}");
+            improved += u32::from(found.peak < own.peak);
+        }
+        assert!(improved > 20, "only {improved} networks gain");
+    }
+
+    #[test]
+    fn a_node_limit_keeps_the_best_order_so_far() {
+        for seed in 0..50 {
+            let needs = random_needs(seed);
+            for limit in 0..30 {
+                let found = search(&needs, limit);
+                assert!(found.nodes <= limit, "seed {seed}");
+                assert_eq!(found.peak, peak_by_ranges(&needs, &found.order), "seed {seed}");
+            }
+        }
+    }
+}

@@ -67,7 +67,7 @@ impl Target {
                 kernels: vec![KernelId::Direct],
             });
         }
-        if !Path::new(name).extension().is_some_and(|e| e == "toml") {
+        if Path::new(name).extension().is_none_or(|e| e != "toml") {
             let names: Vec<&str> = BUILT_IN.iter().map(|b| b.0).collect();
             return Err(Error::new(ErrorCode::Usage, "target", format!("unknown target '{name}'"))
                 .with_help(format!("use one of {}, or a file FILE.toml", names.join(", "))));

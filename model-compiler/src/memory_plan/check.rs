@@ -121,7 +121,7 @@ impl<'a> Checker<'a> {
         if bytes != expected {
             self.problems.push(format!("{name}: {bytes} bytes, expected {expected}"));
         }
-        if offset % alignment != 0 {
+        if !offset.is_multiple_of(alignment) {
             self.problems.push(format!("{name}: offset {offset} is not a multiple of {alignment}"));
         }
         if offset.checked_add(bytes).is_none_or(|end| end > self.plan.arena_bytes) {

@@ -27,7 +27,8 @@ pub(crate) struct Needs {
     pub overwritable: Vec<Vec<usize>>,
     /// Exact scratch bytes per step.
     pub scratch: Vec<u64>,
-    alignment: u64,
+    /// Of tensors, bytes.
+    pub alignment: u64,
 }
 
 impl Needs {

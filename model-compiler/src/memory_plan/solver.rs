@@ -74,7 +74,7 @@ impl Block {
     }
 }
 
-/// Packs the items; all sizes are multiples of one unit (the alignment), so all offsets are.
+/// Packs the items; where all sizes are multiples of the alignment, all offsets are.
 pub(crate) fn pack(items: &[Item], node_limit: u64) -> Packing {
     let (bound, peak_step) = lower_bound(items);
     let (blocks, sections) = to_sections(items);
@@ -88,7 +88,7 @@ pub(crate) fn pack(items: &[Item], node_limit: u64) -> Packing {
     Packing { offsets: best, peak, bound, peak_step, status, nodes }
 }
 
-/// Stages 2 and 3.
+/// Stages 2 to 4.
 fn improve(
     blocks: &[Block],
     sections: usize,
@@ -97,34 +97,47 @@ fn improve(
     best: &mut Vec<u64>,
     nodes: &mut u64,
 ) -> PlanStatus {
-    if let Some(offsets) = by_joins(blocks, sections, bound, node_limit / 2, nodes) {
+    let found = by_core(blocks, sections, bound, node_limit / 4, nodes)
+        .or_else(|| by_joins(blocks, sections, bound, node_limit / 2, nodes));
+    if let Some(offsets) = found {
         *best = offsets;
         return PlanStatus::Optimal;
     }
     let half = *nodes + node_limit.saturating_sub(*nodes) / 2;
-    let bound_reachable = match skyline::search(blocks, sections, bound, half, nodes) {
-        Outcome::Found(offsets) => {
-            *best = offsets;
-            return PlanStatus::Optimal;
-        }
-        Outcome::Exhausted => Some(false),
-        Outcome::Limit => None,
-    };
-    loop {
-        let peak = peak_of(blocks, best);
-        match skyline::search(blocks, sections, peak - 1, node_limit, nodes) {
+    if let Outcome::Found(offsets) = skyline::search(blocks, sections, bound, half, nodes) {
+        *best = offsets;
+    }
+    while peak_of(blocks, best) > bound {
+        match skyline::search(blocks, sections, peak_of(blocks, best) - 1, node_limit, nodes) {
             Outcome::Found(offsets) => *best = offsets,
             Outcome::Exhausted => return PlanStatus::OptimalBoundNotReachable,
             Outcome::Limit => return PlanStatus::NodeLimit,
         }
-        if peak_of(blocks, best) == bound {
-            debug_assert_ne!(bound_reachable, Some(false), "exhausted, yet reached");
-            return PlanStatus::Optimal;
-        }
     }
+    PlanStatus::Optimal
 }
 
-/// Stage 2: the exact search over blocks that were joined where there is no slack.
+/// Stage 2: packs the blocks at the peak exactly, the others around them.
+fn by_core(blocks: &[Block], sections: usize, bound: u64, node_limit: u64, nodes: &mut u64) -> Option<Vec<u64>> {
+    let sums = section_sums(blocks, sections);
+    let mut in_core: Vec<bool> = blocks.iter().map(|b| sums[b.first..=b.last].contains(&bound)).collect();
+    while in_core.contains(&false) {
+        let (core, rest): (Vec<usize>, Vec<usize>) = (0..blocks.len()).partition(|&id| in_core[id]);
+        let shapes: Vec<Block> = core.iter().map(|&id| blocks[id].clone()).collect();
+        let Outcome::Found(bases) = skyline::search(&shapes, sections, bound, node_limit, nodes) else { return None };
+        let mut offsets = vec![0; blocks.len()];
+        core.iter().zip(bases).for_each(|(&id, base)| offsets[id] = base);
+        *nodes += rest.len() as u64;
+        let misfits = first_fit::place_around(blocks, core, rest, bound, &mut offsets);
+        if misfits.is_empty() {
+            return Some(offsets);
+        }
+        misfits.into_iter().for_each(|id| in_core[id] = true);
+    }
+    None
+}
+
+/// Stage 3: the exact search over blocks that were joined where there is no slack.
 fn by_joins(blocks: &[Block], sections: usize, bound: u64, node_limit: u64, nodes: &mut u64) -> Option<Vec<u64>> {
     for attempt in 0..JOIN_ATTEMPTS {
         let joined = joins::join(blocks, sections, bound, attempt);
@@ -142,6 +155,12 @@ fn by_joins(blocks: &[Block], sections: usize, bound: u64, node_limit: u64, node
         }
     }
     None
+}
+
+fn section_sums(blocks: &[Block], sections: usize) -> Vec<u64> {
+    let mut sums = vec![0; sections];
+    blocks.iter().for_each(|b| (b.first..=b.last).for_each(|t| sums[t] += b.height(t)));
+    sums
 }
 
 fn peak_of(blocks: &[Block], offsets: &[u64]) -> u64 {

@@ -12,11 +12,13 @@
 //! | velocity, goal, waypoints | fixed point |
 
 use super::QuantizeOptions;
+use super::factors::round;
 use super::ranges::{Quantization, affine_i8, symmetric_i8, symmetric_i16};
 use crate::calibrate::Statistics;
 use crate::error::Result;
 use crate::ir::{Graph, InputKind, Node, Op, ValueId};
 use firmware::tensor::ElementType;
+use std::collections::HashMap;
 
 /// How one value is stored.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -46,6 +48,13 @@ impl Stored {
         Self { element: ElementType::I16, ..Self::i8(q) }
     }
 
+    /// The representable real value nearest to `x`.
+    pub fn rounded(&self, x: f64) -> f64 {
+        let (min, max) = super::code_range(self.element);
+        let z = f64::from(self.zero_point);
+        (round(x / self.scale + z).clamp(f64::from(min), f64::from(max)) - z) * self.scale
+    }
+
     fn fixed(element: ElementType, scale: f64, zero_point: i32) -> Self {
         Self { element, scale, zero_point, saturation_ppm: None }
     }
@@ -53,12 +62,21 @@ impl Stored {
 
 /// The storage of every value of a graph.
 #[derive(Clone, Debug)]
-pub struct Types(Vec<Stored>);
+pub struct Types {
+    stored: Vec<Stored>,
+    /// i8 form of the 16-bit values that a convolution reads.
+    narrowed: HashMap<ValueId, Stored>,
+}
 
 impl Types {
     /// Storage of one value.
     pub fn of(&self, id: ValueId) -> &Stored {
-        &self.0[id.0 as usize]
+        &self.stored[id.0 as usize]
+    }
+
+    /// How a convolution reads a value: as it is stored, or its i8 copy.
+    pub fn narrow(&self, id: ValueId) -> &Stored {
+        self.narrowed.get(&id).unwrap_or_else(|| self.of(id))
     }
 }
 
@@ -115,7 +133,10 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
             types[node.output.0 as usize].scale = types[node.inputs[0].0 as usize].scale;
         }
     }
-    Ok(Types(types))
+    let convolved = graph.nodes.iter().filter(|n| matches!(n.op, Op::Conv2d(_))).map(|n| n.inputs[0]);
+    let wide = convolved.filter(|id| types[id.0 as usize].element != ElementType::I8);
+    let narrowed = wide.map(|id| (id, Stored::i8(affine_i8(statistics.of(id), options.ranges)))).collect();
+    Ok(Types { stored: types, narrowed })
 }
 
 /// Start state of the decoder: scale `2^-f`, `f = 15 − max(0, ceil(log2(1.25·max|h0|)))`.

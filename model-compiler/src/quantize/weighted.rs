@@ -124,6 +124,7 @@ impl Builder<'_> {
         let magnitude = self.magnitude(input);
         let raw_magnitude = if self.model.tensor(input).element == ElementType::I8 { 383.0 } else { 32768.0 };
         let means = &self.statistics.of(source).channel_mean;
+        let quantized_means = &self.quantized_means[source.0 as usize];
         let mut integer = IntegerLayer {
             weights: Vec::with_capacity(layer.weights.len()),
             weight_scales: Vec::with_capacity(layer.outputs),
@@ -141,9 +142,12 @@ impl Builder<'_> {
             let codes: Vec<f64> = row.iter().map(|w| round(w / scale).clamp(-127.0, 127.0)).collect();
             let mean_of = |k: usize| layer.normalization.map_or(0.0, |n| f64::from(n.mean[layer.channel(o, k)]));
             if self.options.bias_correction {
-                let errors = codes.iter().zip(&row).enumerate();
-                bias -=
-                    errors.map(|(k, (q, w))| (q * scale - w) * (means[layer.channel(o, k)] - mean_of(k))).sum::<f64>();
+                // What the layer gives on average with quantized weights and inputs, less what it should give.
+                let mean_error = |(k, (q, w)): (usize, (&f64, &f64))| {
+                    let (channel, center) = (layer.channel(o, k), mean_of(k));
+                    q * scale * (quantized_means[channel] - center) - w * (means[channel] - center)
+                };
+                bias -= codes.iter().zip(&row).enumerate().map(mean_error).sum::<f64>();
             }
             let code_sum: f64 = codes.iter().sum();
             let code_magnitude: f64 = codes.iter().map(|q| q.abs()).sum();

@@ -53,9 +53,9 @@ fn run<T: Code>(
                 Some(query) => widen(query, row.query),
                 None => widen(codes, row.query),
             }
-            row.score(key, channels, head);
+            row.score(key, heads, head);
             let sum = row.exponentiate(args, table);
-            row.mix(value, channels, head);
+            row.mix(value, heads, head);
             row.write(args, sum, codes);
         }
     }
@@ -81,9 +81,10 @@ impl<'a> RowScratch<'a> {
     }
 
     /// `a_j = Σ q·k_j`.
-    fn score(&mut self, key: &[i8], channels: usize, head: usize) {
-        for (logit, key) in self.keys.iter_mut().zip(key.chunks_exact(channels)) {
-            [*logit] = dot(block(key, head, self.query.len()).unwrap_or_default(), [&*self.query]);
+    fn score(&mut self, key: &[i8], heads: usize, head: usize) {
+        for (j, logit) in self.keys.iter_mut().enumerate() {
+            let key = block(key, j * heads + head, self.query.len()).unwrap_or_default();
+            [*logit] = dot(key, [&*self.query]);
         }
     }
 
@@ -106,11 +107,11 @@ impl<'a> RowScratch<'a> {
     }
 
     /// `A_t = Σ_j e_j·v_jt`.
-    fn mix(&mut self, value: &[i8], channels: usize, head: usize) {
+    fn mix(&mut self, value: &[i8], heads: usize, head: usize) {
         self.context.fill(0);
-        for (e, value) in self.keys.iter().zip(value.chunks_exact(channels)) {
+        for (j, e) in self.keys.iter().enumerate() {
             let e = saturate_i16(i64::from(*e));
-            let value = block(value, head, self.context.len()).unwrap_or_default();
+            let value = block(value, j * heads + head, self.context.len()).unwrap_or_default();
             for (sum, v) in self.context.iter_mut().zip(value) {
                 *sum = sum.wrapping_add(i32::from(e) * i32::from(*v));
             }

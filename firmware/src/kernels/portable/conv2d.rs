@@ -1,7 +1,7 @@
-//! Portable convolution: windows gathered into scratch, then the [product](super::product) of a tile of them.
+//! Portable convolution: windows gathered into scratch, then the product of a tile of them with the weights.
 
 use super::axis::Axis;
-use super::codes::{Code, block, take, widen};
+use super::codes::{Code, block, block_mut, take, widen};
 use super::product::{Product, TILE};
 use crate::fault::{self, Fault};
 use crate::kernels::Conv2dArgs;
@@ -23,7 +23,7 @@ fn run<T: Code>(args: &Conv2dArgs<'_>, input: &[i8], output: &mut [T], mut scrat
     let Some(source) = Source::new(args, input) else { return };
     let (Some(outputs_per_group), Some(width)) = (
         args.output_shape.channels.checked_div(args.groups).map(usize::from),
-        core::num::NonZeroU32::new(u32::from(args.output_shape.width)),
+        core::num::NonZeroUsize::new(usize::from(args.output_shape.width)),
     ) else {
         return;
     };
@@ -49,21 +49,22 @@ fn run<T: Code>(args: &Conv2dArgs<'_>, input: &[i8], output: &mut [T], mut scrat
             if step == 1 && first % width == width.get() - 1 {
                 continue;
             }
-            let mut count = 0;
-            for (position, row) in (first..end).zip(tile.chunks_exact_mut(depth)).take(step) {
-                source.gather(group, index(position / width), index(position % width), row);
-                count += 1;
+            let count = step.min(end - first);
+            for i in 0..count {
+                if let Some(row) = block_mut(tile, i, depth) {
+                    source.gather(group, (first + i) / width, (first + i) % width, row);
+                }
             }
-            product.tile(tile.get(..count * depth).unwrap_or_default(), index(first), output);
+            product.tile(tile.get(..count * depth).unwrap_or_default(), first, output);
         }
     }
 }
 
 /// End of the output positions and how many are taken at a time: all, by tiles. (The faults leave out the last row, or
 /// go by single positions to leave out the last column.)
-fn traversal(output: Shape) -> (u32, usize) {
-    let last_row = if fault::active(Fault::LastRow) { u32::from(output.width) } else { 0 };
-    (output.positions() - last_row, if fault::active(Fault::LastColumn) { 1 } else { TILE })
+fn traversal(output: Shape) -> (usize, usize) {
+    let last_row = if fault::active(Fault::LastRow) { usize::from(output.width) } else { 0 };
+    (index(output.positions()) - last_row, if fault::active(Fault::LastColumn) { 1 } else { TILE })
 }
 
 /// The input of a convolution as its windows see it.

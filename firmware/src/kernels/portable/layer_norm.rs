@@ -1,6 +1,6 @@
 //! Portable LayerNorm.
 
-use super::codes::{Code, value};
+use super::codes::{Code, block_mut, value};
 use crate::fault::{self, Fault};
 use crate::fixed_point::{bits, divide, finish, isqrt, round_shift, saturate_i64};
 use crate::kernels::LayerNormArgs;
@@ -25,8 +25,8 @@ fn run<I: Code, O: Code>(args: &LayerNormArgs<'_>, input: &[I], output: &mut [O]
     if channels == 0 {
         return;
     }
-    let rows = input.chunks_exact(channels).zip(output.chunks_exact_mut(channels));
-    for (row, codes) in rows.take(index(args.rows)) {
+    for (i, row) in input.chunks_exact(channels).take(index(args.rows)).enumerate() {
+        let Some(codes) = block_mut(output, i, channels) else { return };
         let statistics = Statistics::of(args, row);
         let constants = args.gains.iter().zip(args.offsets);
         for ((code, x), (gain, offset)) in codes.iter_mut().zip(row).zip(constants) {

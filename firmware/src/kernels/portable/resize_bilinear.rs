@@ -41,14 +41,15 @@ fn run<I: Code, O: Code>(args: &ResizeArgs<'_>, input: &[I], output: &mut [O]) {
     for (y, row) in args.rows.iter().enumerate() {
         let mut vertical = Neighbors::new(*row, args.input_shape.height, args.weight_bits);
         if fault::active(Fault::ResizeWeights) {
-            vertical.weights.reverse();
+            vertical = vertical.swapped();
         }
         for (x, column) in args.columns.iter().enumerate() {
             let horizontal = Neighbors::new(*column, args.input_shape.width, args.weight_bits);
-            let corners = [(0, 0), (0, 1), (1, 0), (1, 1)].map(|(v, h): (usize, usize)| {
-                let pixel = vertical.indices[v] * input_width + horizontal.indices[h];
-                (block(input, pixel, channels).unwrap_or_default(), vertical.weights[v] * horizontal.weights[h])
-            });
+            let corner = |(row, wy): (usize, i64), (column, wx): (usize, i64)| {
+                (block(input, row * input_width + column, channels).unwrap_or_default(), wy * wx)
+            };
+            let ([top, bottom], [left, right]) = (vertical.0, horizontal.0);
+            let corners = [corner(top, left), corner(top, right), corner(bottom, left), corner(bottom, right)];
             let pixel = y * width + x;
             let codes = block_mut(output, pixel, channels).unwrap_or_default();
             write_pixel(args, &corners, residual.as_ref(), pixel * channels, codes);
@@ -78,19 +79,20 @@ fn write_pixel<I: Code, O: Code>(
     }
 }
 
-/// The two input lines that an output line reads, with their weights.
-struct Neighbors {
-    indices: [usize; 2],
-    weights: [i64; 2],
-}
+/// The two input lines that an output line reads, each with its weight.
+struct Neighbors([(usize, i64); 2]);
 
 impl Neighbors {
     fn new([first, weight]: [u16; 2], size: u16, weight_bits: u32) -> Self {
         let second = first.saturating_add(1).min(size.saturating_sub(1));
-        Self {
-            indices: [usize::from(first), usize::from(second)],
-            weights: [(1 << weight_bits.min(31)) - i64::from(weight), i64::from(weight)],
-        }
+        let (one, weight) = (1 << weight_bits.min(31), i64::from(weight));
+        Self([(usize::from(first), one - weight), (usize::from(second), weight)])
+    }
+
+    /// The same lines with their weights exchanged.
+    fn swapped(self) -> Self {
+        let [(first, w0), (second, w1)] = self.0;
+        Self([(first, w1), (second, w0)])
     }
 }
 

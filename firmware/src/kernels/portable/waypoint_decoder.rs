@@ -27,17 +27,19 @@ pub fn waypoint_decoder(
     if hidden.len() != size {
         return;
     }
-    state.copy_from_slice(hidden);
+    for (value, h0) in state.iter_mut().zip(hidden) {
+        *value = *h0;
+    }
     let mut goal = [*goal_x, *goal_y];
     let mut waypoint = [0; 2];
-    for output in waypoints.chunks_exact_mut(2).take(usize::from(args.steps)) {
+    for output in waypoints.as_chunks_mut::<2>().0.iter_mut().take(usize::from(args.steps)) {
         let input = Input::new(args.concat, waypoint, goal);
         for (unit, value) in next.iter_mut().enumerate() {
             *value = update_unit(args, table, input.codes(), state, unit);
         }
         core::mem::swap(&mut state, &mut next);
         waypoint = advance(args, waypoint, state);
-        output.copy_from_slice(&waypoint);
+        *output = waypoint;
         if fault::active(Fault::GoalFirstStepOnly) {
             goal = [0; 2];
         }

@@ -34,8 +34,31 @@ pub(super) fn search(blocks: &[Block], bound: u64, node_limit: u64, nodes: &mut 
     best.map(|(_, offsets)| offsets).unwrap_or_default()
 }
 
+/// Places `rest`, largest first, around `placed`; returns those that end above `capacity`.
+pub(super) fn place_around(
+    blocks: &[Block],
+    mut placed: Vec<usize>,
+    mut rest: Vec<usize>,
+    capacity: u64,
+    offsets: &mut [u64],
+) -> Vec<usize> {
+    rest.sort_by_key(|&i| std::cmp::Reverse(KEYS[0](&blocks[i])));
+    let mut misfits = Vec::new();
+    for i in rest {
+        offsets[i] = lowest_fit(blocks, offsets, &placed, i);
+        placed.push(i);
+        if offsets[i] + blocks[i].heights[0] > capacity {
+            misfits.push(i);
+        }
+    }
+    misfits
+}
+
+/// What blocks are sorted by.
+type Key = fn(&Block) -> (u64, u64);
+
 /// Orders to start from, largest key first.
-const KEYS: [fn(&Block) -> (u64, u64); 4] = [
+const KEYS: [Key; 4] = [
     |b| (b.heights[0], b.heights.len() as u64),
     |b| (b.area(), b.heights[0]),
     |b| (b.heights.len() as u64, b.heights[0]),

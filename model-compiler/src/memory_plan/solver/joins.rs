@@ -6,7 +6,7 @@
 //! Cuts of a rectangle are undone this way, smallest first. A join is a guess (only one ender with one starter is
 //! forced), so the exact search still has to place what remains.
 
-use super::Block;
+use super::{Block, section_sums};
 use std::collections::BTreeMap;
 
 /// Largest number of blocks on one side of a boundary whose subsets are tried.
@@ -37,10 +37,7 @@ pub(super) struct Joined {
 /// takes the first, others a pseudorandom one.
 pub(super) fn join(blocks: &[Block], sections: usize, capacity: u64, attempt: u64) -> Vec<Joined> {
     let mut ties = Ties(attempt);
-    let mut sums = vec![0; sections];
-    for block in blocks {
-        (block.first..=block.last).for_each(|t| sums[t] += block.height(t));
-    }
+    let sums = section_sums(blocks, sections);
     let mut groups: Vec<Joined> =
         blocks.iter().enumerate().map(|(id, b)| Joined { block: b.clone(), members: vec![(id, 0)] }).collect();
     let tight: Vec<usize> = (1..sections).filter(|&t| sums[t - 1] == capacity && sums[t] == capacity).collect();
