@@ -2,4 +2,5 @@
 
 pub mod build;
 pub mod golden;
+pub mod project;
 pub mod torch_file;
