@@ -2,6 +2,7 @@
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
+use crate::ablation;
 use crate::files::FrameSource;
 use crate::report::{VerifyReport, json, terminal};
 use crate::{run, verify};
@@ -17,7 +18,8 @@ const EXAMPLES: &str = "Examples:
   host-sim run transfuser.img --frames frames/
   host-sim run transfuser.pth --inputs inputs.safetensors --json
   host-sim verify transfuser.img --model transfuser.pth --frames frames/ --mirror --min-sqnr 20
-  host-sim verify transfuser.img --inputs inputs.safetensors";
+  host-sim verify transfuser.img --inputs inputs.safetensors
+  host-sim ablate transfuser.pth --calib frames/ --frames drive/";
 
 /// Runs a driving network on the firmware's own engine, and proves that its numbers are right.
 #[derive(Debug, Parser)]
@@ -67,6 +69,24 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
+    /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, waypoint error.
+    #[command(after_help = EXAMPLES)]
+    Ablate {
+        /// Checkpoint.
+        model: PathBuf,
+        #[command(flatten)]
+        import: ImportArgs,
+        /// Calibration frames: a frame directory or a .safetensors file of raw inputs.
+        #[arg(long, value_name = "FRAMES|FILE")]
+        calib: PathBuf,
+        #[command(flatten)]
+        frames: FrameSource,
+        /// Also evaluate on the mirror image of every frame.
+        #[arg(long)]
+        mirror: bool,
+        #[command(flatten)]
+        common: Common,
+    },
 }
 
 #[derive(Debug, Args)]
@@ -105,7 +125,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
 impl Command {
     fn common(&self) -> &Common {
         match self {
-            Self::Run { common, .. } | Self::Verify { common, .. } => common,
+            Self::Run { common, .. } | Self::Verify { common, .. } | Self::Ablate { common, .. } => common,
         }
     }
 
@@ -126,6 +146,12 @@ impl Command {
                 warn(&report, console);
                 console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
                 Ok(conclude(&report, common.json, console))
+            }
+            Self::Ablate { model, import, calib, frames, mirror, common } => {
+                let options = ablation::Options { model, import: import.options()?, calib, frames, mirror };
+                let rows = ablation::ablate(&options, &progress)?;
+                console.print(&if common.json { json::ablation(&rows).to_string() } else { terminal::ablation(&rows) });
+                Ok(0)
             }
         }
     }

@@ -1,6 +1,7 @@
 //! The forms for people: tables with a line per frame or step, and a short summary.
 
 use super::{StepReport, VerifyReport};
+use crate::ablation::Row;
 use crate::run::{FrameResult, RunReport};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
@@ -30,6 +31,18 @@ pub fn verify(report: &VerifyReport) -> String {
     let _ = writeln!(text, "{}\n", table(header.map(str::to_owned).to_vec(), &[1, 2, 3, 4], rows));
     summary(&mut text, report);
     text
+}
+
+/// One line per variant of the quantizer.
+pub fn ablation(rows: &[Row]) -> String {
+    let waypoints = rows.first().map_or(0, |row| row.fidelity.mean_mm.len());
+    let numbered = |what: &str| (1..=waypoints).map(|k| format!("{what} mm {k}")).collect::<Vec<_>>();
+    let header = [vec!["variant".to_owned(), "vector dB".to_owned()], numbered("mean"), numbered("worst")].concat();
+    let line = |row: &Row| {
+        let millimeters = row.fidelity.mean_mm.iter().chain(&row.fidelity.worst_mm).map(|mm| format!("{mm:.0}"));
+        [row.variant.to_owned(), figure(row.fidelity.vector_sqnr_db.into(), 2)].into_iter().chain(millimeters).collect()
+    };
+    format!("{}\n", table(header, &[0], rows.iter().map(line)))
 }
 
 fn step_row(step: &StepReport) -> Vec<String> {
