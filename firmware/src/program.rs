@@ -7,6 +7,14 @@
 //! Evolution: a variant is never changed, only added at the end, and each kind has a feature bit
 //! ([`Step::feature`]), so an older runtime refuses a newer image by name.
 
+#![deny(
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects,
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic
+)]
+
 use crate::tensor::TensorId;
 use serde::{Deserialize, Serialize};
 
@@ -25,6 +33,18 @@ pub struct ConstRange {
 pub enum KernelId {
     /// Canonical order: weights `[output][kh][kw][input]` (`[output][input]` for linear), depth contiguous.
     Direct,
+}
+
+impl KernelId {
+    /// All kernels of this format.
+    pub const ALL: &'static [Self] = &[Self::Direct];
+
+    /// Bit of the header's `features` word that an image with this kernel must set.
+    pub const fn feature(self) -> u64 {
+        1 << match self {
+            Self::Direct => 32,
+        }
+    }
 }
 
 /// Kernel size, stride, explicit padding and dilation of a sliding window, in pixels.
@@ -60,15 +80,27 @@ impl Window {
             if kernel == 0 || dilation == 0 || stride == 0 {
                 return None;
             }
-            let padded = u32::from(size) + u32::from(before) + u32::from(after);
-            let reach = u32::from(dilation) * (u32::from(kernel) - 1) + 1;
-            let steps = padded.checked_sub(reach)? / u32::from(stride);
-            u16::try_from(steps + 1).ok()
+            let padded = u32::from(size).checked_add(u32::from(before))?.checked_add(u32::from(after))?;
+            let steps = padded.checked_sub(reach(kernel, dilation))?.checked_div(u32::from(stride))?;
+            u16::try_from(steps.checked_add(1)?).ok()
         }
         let h = axis(height, self.pad_top, self.pad_bottom, self.kernel_h, self.dilation_h, self.stride_h)?;
         let w = axis(width, self.pad_left, self.pad_right, self.kernel_w, self.dilation_w, self.stride_w)?;
         Some((h, w))
     }
+
+    /// Whether all padding is smaller than the kernel's reach, so that no window lies in padding alone.
+    pub fn padding_is_inside(&self) -> bool {
+        let vertical = reach(self.kernel_h, self.dilation_h);
+        let horizontal = reach(self.kernel_w, self.dilation_w);
+        u32::from(self.pad_top.max(self.pad_bottom)) < vertical
+            && u32::from(self.pad_left.max(self.pad_right)) < horizontal
+    }
+}
+
+/// Pixels from the first to the last tap of a kernel, both included.
+fn reach(kernel: u8, dilation: u8) -> u32 {
+    u32::from(dilation).saturating_mul(u32::from(kernel).saturating_sub(1)).saturating_add(1)
 }
 
 /// Saturation bounds of an output, in codes; ReLU is a lower bound equal to the zero point.
@@ -451,7 +483,20 @@ pub enum Step {
     WaypointDecoder(WaypointDecoder),
 }
 
+impl Rescale {
+    /// The stored operand of the second term.
+    pub const fn residual_tensor(&self) -> Option<TensorId> {
+        match self.residual {
+            Residual::None => None,
+            Residual::Scaled { tensor, .. } | Residual::Stream { tensor } => Some(tensor),
+        }
+    }
+}
+
 impl Step {
+    /// Union of the feature bits of all step kinds and kernels of this format.
+    pub const KNOWN_FEATURES: u64 = ((1 << 12) - 1) | KernelId::Direct.feature();
+
     /// Operator name as reports print it.
     pub const fn name(&self) -> &'static str {
         match self {
@@ -514,6 +559,47 @@ impl Step {
             Self::Attention(s) => s.scratch,
             Self::WaypointDecoder(s) => s.scratch,
             _ => None,
+        }
+    }
+
+    /// The packing of a weighted step.
+    pub const fn kernel(&self) -> Option<KernelId> {
+        match self {
+            Self::Conv2d(s) => Some(s.kernel),
+            Self::Linear(s) => Some(s.kernel),
+            _ => None,
+        }
+    }
+
+    /// The tensors that the step reads, in operand order (residual last); one may occur twice.
+    pub fn reads(&self) -> [Option<TensorId>; 3] {
+        match self {
+            Self::Conv2d(s) => [Some(s.input), s.rescale.residual_tensor(), None],
+            Self::Linear(s) => [Some(s.input), s.rescale.residual_tensor(), None],
+            Self::MaxPool(s) => [Some(s.input), None, None],
+            Self::AveragePool(s) => [Some(s.input), None, None],
+            Self::GlobalPool(s) => [Some(s.first.tensor), s.second.map(|term| term.tensor), None],
+            Self::Add(s) => [Some(s.first.tensor), Some(s.second.tensor), None],
+            Self::Requantize(s) => [Some(s.input), None, None],
+            Self::ResizeBilinear(s) => [Some(s.input.tensor), s.residual.map(|term| term.tensor), None],
+            Self::Tokens(s) => [Some(s.first.map), Some(s.second.map), Some(s.velocity)],
+            Self::LayerNorm(s) => [Some(s.input), None, None],
+            Self::Attention(s) => [Some(s.query), Some(s.key), Some(s.value)],
+            Self::WaypointDecoder(s) => [Some(s.hidden), Some(s.goal), None],
+        }
+    }
+
+    /// The operands that the output may overwrite where element types agree (a max pool also needs
+    /// [`crate::kernels::plan::max_pool_in_place`]).
+    pub fn overwritable(&self) -> [Option<TensorId>; 2] {
+        match self {
+            Self::Conv2d(s) => [s.rescale.residual_tensor(), None],
+            Self::Linear(s) => [s.rescale.residual_tensor(), None],
+            Self::MaxPool(s) => [Some(s.input), None],
+            Self::Add(s) => [Some(s.first.tensor), Some(s.second.tensor)],
+            Self::ResizeBilinear(s) => [s.residual.map(|term| term.tensor), None],
+            Self::Attention(s) => [Some(s.query), None],
+            _ => [None, None],
         }
     }
 }

@@ -80,6 +80,23 @@ impl ElementType {
         }
     }
 
+    /// Zero points that an operand of this type may have: any code for 8 bits, 0 otherwise.
+    pub const fn zero_points(self) -> core::ops::RangeInclusive<i16> {
+        match self {
+            Self::I8 => -128..=127,
+            Self::I16 | Self::I32 | Self::Scratch => 0..=0,
+        }
+    }
+
+    /// Codes of an 8- or 16-bit activation; 0 alone for the other types, which hold no codes.
+    pub const fn codes(self) -> core::ops::RangeInclusive<i16> {
+        match self {
+            Self::I8 => -128..=127,
+            Self::I16 => i16::MIN..=i16::MAX,
+            Self::I32 | Self::Scratch => 0..=0,
+        }
+    }
+
     /// The type with this stored code.
     pub const fn from_code(code: u8) -> Option<Self> {
         match code {

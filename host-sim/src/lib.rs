@@ -1,2 +1,26 @@
-//! Runs the firmware's engine on the host.
+//! Runs the firmware's engine on the host and says how good its numbers are.
+//!
+//! * [`run`]: waypoints of frames, int8 from an image or f32 from a checkpoint
+//! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
+//!   f32 network: how much precision each step costs
+//!
+//! ```text
+//!             ┌► engine (the firmware's own code) ─► bytes of every step ─┐
+//! raw inputs ─┼► f64 model, from the build record ─► bytes of every step ─┴► compare: must be equal   (compare)
+//!             └► f32 reference, from the checkpoint ► activations ─────────► statistics per step       (statistics)
+//! ```
+//!
+//! [`trace`] takes one frame that way; memory holds one frame at a time, figures are summed over frames.
 #![forbid(unsafe_code)]
+
+pub mod ablation;
+pub mod buffers;
+// pub mod cli;
+pub mod codes;
+pub mod compare;
+pub mod files;
+// pub mod report;
+// pub mod run;
+pub mod statistics;
+pub mod trace;
+// pub mod verify;

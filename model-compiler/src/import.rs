@@ -1,1 +1,261 @@
-//! import
+//! From a checkpoint's tensors to the float graph.
+//!
+//! The readers ([`checkpoint`]) give [`NamedTensors`]; the system is told from the names; every size of the network
+//! (channels, blocks, fusion scales, transformer layers, hidden sizes) from the shapes; the graph that comes out stays
+//! close to the framework's modules and carries their names. A checkpoint that does not fit is refused with one list
+//! of all its tensors that are missing, surplus, misshapen or not finite.
+
+use crate::error::{Error, ErrorCode, Result};
+use crate::ir::Graph;
+use std::collections::BTreeMap;
+use std::ops::Bound;
+use std::str::FromStr;
+
+pub mod checkpoint;
+mod systems;
+
+/// Elements of a checkpoint tensor.
+#[derive(Clone, Debug, PartialEq)]
+pub enum TensorData {
+    /// Row-major values.
+    Float(Vec<f32>),
+    /// An integer tensor: no network here has one that matters (`num_batches_tracked` counts training steps).
+    Integer,
+}
+
+/// A tensor of a checkpoint.
+#[derive(Clone, Debug, PartialEq)]
+pub struct NamedTensor {
+    /// Dimensions, outermost first; empty for a scalar.
+    pub shape: Vec<usize>,
+    /// Elements, as many as the shape says.
+    pub data: TensorData,
+}
+
+/// The tensors of a checkpoint by name, in the order of their names.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct NamedTensors {
+    tensors: BTreeMap<String, NamedTensor>,
+}
+
+impl NamedTensors {
+    /// The given float tensors (name, shape, row-major values) and integer tensors (name, shape).
+    pub fn new(
+        floats: impl IntoIterator<Item = (String, Vec<usize>, Vec<f32>)>,
+        integers: impl IntoIterator<Item = (String, Vec<usize>)>,
+    ) -> Self {
+        let floats = floats.into_iter().map(|(n, shape, v)| (n, NamedTensor { shape, data: TensorData::Float(v) }));
+        let integers = integers.into_iter().map(|(n, shape)| (n, NamedTensor { shape, data: TensorData::Integer }));
+        Self { tensors: floats.chain(integers).collect() }
+    }
+
+    /// Adds or replaces a tensor.
+    pub fn insert(&mut self, name: impl Into<String>, tensor: NamedTensor) {
+        self.tensors.insert(name.into(), tensor);
+    }
+
+    /// Takes a tensor out.
+    pub fn remove(&mut self, name: &str) -> Option<NamedTensor> {
+        self.tensors.remove(name)
+    }
+
+    /// The tensor of this name.
+    pub fn get(&self, name: &str) -> Option<&NamedTensor> {
+        self.tensors.get(name)
+    }
+
+    /// The tensor of this name, to change it.
+    pub fn get_mut(&mut self, name: &str) -> Option<&mut NamedTensor> {
+        self.tensors.get_mut(name)
+    }
+
+    /// All tensors, in the order of their names.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &NamedTensor)> + '_ {
+        self.tensors.iter().map(|(name, tensor)| (name.as_str(), tensor))
+    }
+
+    /// The tensors whose names start with `prefix`.
+    pub fn under<'a>(&'a self, prefix: &'a str) -> impl Iterator<Item = (&'a str, &'a NamedTensor)> + 'a {
+        self.tensors
+            .range::<str, _>((Bound::Included(prefix), Bound::Unbounded))
+            .take_while(move |(name, _)| name.starts_with(prefix))
+            .map(|(name, tensor)| (name.as_str(), tensor))
+    }
+
+    /// Number of tensors.
+    pub fn len(&self) -> usize {
+        self.tensors.len()
+    }
+
+    /// Whether there is no tensor.
+    pub fn is_empty(&self) -> bool {
+        self.tensors.is_empty()
+    }
+}
+
+impl From<checkpoint::Checkpoint> for NamedTensors {
+    fn from(checkpoint: checkpoint::Checkpoint) -> Self {
+        let tensors = checkpoint.into_tensors().into_iter().map(|tensor| {
+            let data = match tensor.data {
+                checkpoint::TensorData::Float(values) => TensorData::Float(values),
+                checkpoint::TensorData::Integer(_) => TensorData::Integer,
+            };
+            (tensor.name, NamedTensor { shape: tensor.shape, data })
+        });
+        Self { tensors: tensors.collect() }
+    }
+}
+
+/// A driving network that is told from its tensor names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum System {
+    /// Image only (ResNet-34), waypoints.
+    Aim,
+    /// Image and LiDAR, added at the end, waypoints.
+    LateFusion,
+    /// Image and LiDAR, fused by transformers at up to four scales, waypoints.
+    TransFuser,
+    /// Image and LiDAR, fused by projection; recognized, not supported.
+    GeometricFusion,
+    /// Conditional imitation learning; recognized, not supported.
+    Cilrs,
+    /// Learning by cheating; recognized, not supported.
+    Lbc,
+}
+
+impl System {
+    /// Every system that is recognized.
+    pub const ALL: [Self; 6] =
+        [Self::Aim, Self::LateFusion, Self::TransFuser, Self::GeometricFusion, Self::Cilrs, Self::Lbc];
+
+    /// Name on the command line and in reports.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Aim => "aim",
+            Self::LateFusion => "late_fusion",
+            Self::TransFuser => "transfuser",
+            Self::GeometricFusion => "geometric_fusion",
+            Self::Cilrs => "cilrs",
+            Self::Lbc => "lbc",
+        }
+    }
+
+    /// The system whose tensor names these are.
+    pub fn detect(tensors: &NamedTensors) -> Option<Self> {
+        systems::detect(tensors)
+    }
+}
+
+impl FromStr for System {
+    type Err = Error;
+
+    fn from_str(name: &str) -> Result<Self> {
+        Self::ALL.into_iter().find(|s| s.name() == name).ok_or_else(|| {
+            let names: Vec<_> = Self::ALL.iter().map(|s| s.name()).collect();
+            Error::new(ErrorCode::Usage, "", format!("unknown system '{name}'"))
+                .with_help(format!("one of {}", names.join(", ")))
+        })
+    }
+}
+
+/// What cannot be told from the tensors.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ImportOptions {
+    /// The system; detected from the tensor names when absent.
+    pub system: Option<System>,
+    /// Attention heads of the transformers.
+    pub heads: u16,
+    /// Height and width of camera image and LiDAR histogram, pixels. When absent: 32 pixels per token where a square
+    /// positional embedding tells the token grid, else 256×256.
+    pub resolution: Option<(u16, u16)>,
+}
+
+impl Default for ImportOptions {
+    fn default() -> Self {
+        Self { system: None, heads: 4, resolution: None }
+    }
+}
+
+/// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
+///
+/// Inputs are `rgb`, `bev`, `velocity` and `goal`, as far as the system has them, in raw units; the output is
+/// `waypoints`. Values carry the names of the checkpoint's modules.
+///
+/// # Errors
+/// `Unsupported`: no known system, one that is not supported, or sizes that do not fit together. `Tensors`: the list
+/// of tensors that are missing, surplus, misshapen or not finite.
+pub fn import(name: &str, tensors: NamedTensors, options: &ImportOptions) -> Result<Graph> {
+    let system =
+        options.system.or_else(|| System::detect(&tensors)).ok_or_else(|| unrecognized(&tensors).within(name))?;
+    systems::build(system, name, tensors, options).map_err(|e| e.within(name))
+}
+
+fn unrecognized(tensors: &NamedTensors) -> Error {
+    let first: Vec<_> = tensors.iter().take(3).map(|(name, _)| name).collect();
+    let message = if first.is_empty() {
+        "the checkpoint holds no tensors".to_string()
+    } else {
+        format!("the tensor names are of no known system ({} tensors: {}, …)", tensors.len(), first.join(", "))
+    };
+    Error::new(ErrorCode::Unsupported, "", message)
+        .with_help("supported are checkpoints of aim, late_fusion and transfuser (2021); --system names one")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn names(names: &[&str]) -> NamedTensors {
+        NamedTensors::new(names.iter().map(|n| (n.to_string(), vec![1], vec![0.0])), [])
+    }
+
+    #[test]
+    fn every_system_is_told_from_its_names() {
+        let image = "image_encoder.features.conv1.weight";
+        for (system, tensors) in [
+            (System::Aim, names(&[image])),
+            (System::LateFusion, names(&[image, "lidar_encoder._model.conv1.weight"])),
+            (
+                System::TransFuser,
+                names(&["encoder.image_encoder.features.conv1.weight", "encoder.transformer4.pos_emb"]),
+            ),
+            (
+                System::GeometricFusion,
+                names(&["encoder.image_encoder.features.conv1.weight", "encoder.image_conv1.weight"]),
+            ),
+            (System::Cilrs, names(&["encoder.features.conv1.weight", "controller.vel_in.0.weight"])),
+            (System::Lbc, names(&["net.network.backbone.conv1.weight"])),
+        ] {
+            assert_eq!(System::detect(&tensors), Some(system));
+            assert_eq!(system.name().parse::<System>().unwrap(), system);
+        }
+        assert_eq!(System::detect(&names(&["fc.weight"])), None);
+    }
+
+    #[test]
+    fn systems_that_come_later_are_refused_by_name() {
+        for system in [System::GeometricFusion, System::Cilrs, System::Lbc] {
+            let options = ImportOptions { system: Some(system), ..Default::default() };
+            let error = import("file.pth", names(&["x"]), &options).unwrap_err();
+            assert_eq!(error.code, ErrorCode::Unsupported);
+            assert!(error.to_string().starts_with("file.pth: "), "{error}");
+            assert!(error.message.contains(system.name()), "{error}");
+        }
+    }
+
+    #[test]
+    fn foreign_checkpoint_is_refused_with_its_first_names() {
+        let error = import("m.pth", names(&["fc.bias", "fc.weight"]), &ImportOptions::default()).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "m.pth: the tensor names are of no known system (2 tensors: fc.bias, fc.weight, …)\n  \
+             help: supported are checkpoints of aim, late_fusion and transfuser (2021); --system names one"
+        );
+    }
+
+    #[test]
+    fn prefix_selects_a_contiguous_range() {
+        let tensors = names(&["a", "ab.c", "ab.d", "abc", "b"]);
+        assert_eq!(tensors.under("ab.").map(|(n, _)| n).collect::<Vec<_>>(), ["ab.c", "ab.d"]);
+    }
+}

@@ -15,6 +15,7 @@ use firmware::program::Window;
 pub use firmware::tensor::Shape;
 use std::sync::Arc;
 
+pub mod cost;
 pub mod verify;
 
 /// Handle of a value (an activation).

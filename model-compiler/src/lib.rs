@@ -1,15 +1,20 @@
 //! Trained driving networks to int8 model images.
 #![forbid(unsafe_code)]
 
+pub mod artifact;
 pub mod calibrate;
+pub mod cli;
 pub mod emit;
 pub mod error;
+pub mod frames;
 pub mod import;
 pub mod integer_reference;
 pub mod ir;
 pub mod memory_plan;
+pub mod metrics;
 pub mod pack;
 pub mod passes;
+pub mod pipeline;
 pub mod qmodel;
 pub mod quantize;
 pub mod record;

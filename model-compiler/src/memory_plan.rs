@@ -52,6 +52,17 @@ pub enum PlanStatus {
     NodeLimit,
 }
 
+impl PlanStatus {
+    /// What people read.
+    pub const fn words(self) -> &'static str {
+        match self {
+            Self::Optimal => "optimal",
+            Self::OptimalBoundNotReachable => "optimal, the bound is not reachable",
+            Self::NodeLimit => "search stopped at its node limit",
+        }
+    }
+}
+
 /// The plan of one model for one target.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MemoryPlan {

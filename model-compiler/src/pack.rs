@@ -1,1 +1,277 @@
-//! pack
+//! Packs a planned model for a target: steps that name tensors and constant ranges, constants in each kernel's order.
+//!
+//! Tensor i of the image is tensor i of the model; scratch buffers follow in the order of the steps that use them.
+
+use crate::artifact;
+use crate::emit::{ConstantsBuilder, ImageParts, ImagePort};
+use crate::error::{Error, ErrorCode, Result};
+use crate::memory_plan::{MemoryPlan, Placement};
+use crate::qmodel::{Port, QModel, QOp, QRescale, QResidual, QTensorId, QTerm, QTokenSource, QWaypointDecoder};
+use firmware::image::TensorRecord;
+use firmware::program::{
+    Add, Attention, AveragePool, Conv2d, GlobalPool, KernelId, LayerNorm, Linear, MaxPool, Requantize, Rescale,
+    Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, WaypointDecoder,
+};
+use firmware::tensor::TensorId;
+
+/// Alignment of the arena itself: enough for every kernel's loads.
+const ARENA_ALIGNMENT: u32 = 16;
+
+/// Packs a model along its plan.
+///
+/// # Errors
+/// More tensors, steps or bytes than the image format can hold.
+pub fn pack(model: &QModel, plan: &MemoryPlan) -> Result<ImageParts> {
+    let mut packer = Packer { constants: ConstantsBuilder::new(), tensors: Vec::new() };
+    for (tensor, placement) in model.tensors.iter().zip(&plan.tensors) {
+        let record = TensorRecord {
+            element: tensor.element,
+            shape: tensor.shape,
+            offset: narrow(placement.offset, "arena offset")?,
+            bytes: narrow(placement.bytes, "tensor bytes")?,
+            first_step: narrow(placement.first_step, "steps")?,
+            last_step: narrow(placement.last_step, "steps")?,
+            in_place_of: placement.in_place_of.map(tensor_id).transpose()?,
+        };
+        packer.tensors.push(record);
+    }
+    let mut steps = Vec::with_capacity(plan.order.len());
+    for (position, &index) in plan.order.iter().enumerate() {
+        let scratch = packer.scratch(position, plan.scratch[position])?;
+        steps.push(packer.step(&model.steps[index as usize].op, scratch)?);
+    }
+    let ports = |ports: &[Port]| ports.iter().map(|port| image_port(model, port)).collect::<Result<Vec<_>>>();
+    Ok(ImageParts {
+        name: model.name[..model.name.floor_char_boundary(32)].to_owned(),
+        tensors: packer.tensors,
+        steps,
+        constants: packer.constants.finish(),
+        inputs: ports(&model.inputs)?,
+        outputs: ports(&model.outputs)?,
+        arena_bytes: narrow(plan.arena_bytes, "arena bytes")?,
+        arena_alignment: ARENA_ALIGNMENT.max(plan.alignment),
+        qmodel_digest: artifact::sha256(&artifact::to_bytes(model)?),
+        build_digest: [0; 32],
+        known_answer: None,
+    })
+}
+
+fn narrow<A: Copy + std::fmt::Display, B: TryFrom<A>>(value: A, what: &str) -> Result<B> {
+    B::try_from(value)
+        .map_err(|_| Error::new(ErrorCode::TooBig, "image", format!("{what}: {value} exceeds what an image can hold")))
+}
+
+fn tensor_id(id: QTensorId) -> Result<TensorId> {
+    Ok(TensorId(narrow(id.0, "tensors")?))
+}
+
+fn image_port(model: &QModel, port: &Port) -> Result<ImagePort> {
+    let tensor = model.tensor(port.tensor);
+    Ok(ImagePort {
+        name: port.name.clone(),
+        tensor: tensor_id(port.tensor)?,
+        scale: tensor.scale as f32,
+        zero_point: tensor.zero_point as i16,
+    })
+}
+
+fn term(term: &QTerm) -> Result<Term> {
+    Ok(Term { tensor: tensor_id(term.tensor)?, zero_point: term.zero_point, multiplier: term.multiplier })
+}
+
+fn token_source(source: &QTokenSource) -> Result<TokenSource> {
+    let QTokenSource { map, zero_point, pool_h, pool_w, multiplier } = *source;
+    Ok(TokenSource { map: tensor_id(map)?, zero_point, pool_h, pool_w, multiplier })
+}
+
+struct Packer {
+    constants: ConstantsBuilder,
+    tensors: Vec<TensorRecord>,
+}
+
+impl Packer {
+    fn scratch(&mut self, position: usize, placement: Option<Placement>) -> Result<Option<TensorId>> {
+        let Some(placement) = placement else { return Ok(None) };
+        let record = TensorRecord::scratch(
+            narrow(placement.offset, "arena offset")?,
+            narrow(placement.bytes, "scratch bytes")?,
+            narrow(position, "steps")?,
+        );
+        let id = TensorId(narrow(self.tensors.len(), "tensors")?);
+        self.tensors.push(record);
+        Ok(Some(id))
+    }
+
+    fn rescale(&mut self, rescale: &QRescale) -> Result<Rescale> {
+        Ok(Rescale {
+            pre_shift: rescale.pre_shift,
+            bias: self.constants.push(&rescale.bias)?,
+            multipliers: self.constants.push(&rescale.multipliers)?,
+            shifts: self.constants.push(&rescale.shifts)?,
+            zero_point: rescale.zero_point,
+            clamp: rescale.clamp,
+            residual: match &rescale.residual {
+                QResidual::None => Residual::None,
+                QResidual::Scaled { tensor, zero_point, multipliers } => Residual::Scaled {
+                    tensor: tensor_id(*tensor)?,
+                    zero_point: *zero_point,
+                    multipliers: self.constants.push(multipliers)?,
+                },
+                QResidual::Stream { tensor } => Residual::Stream { tensor: tensor_id(*tensor)? },
+            },
+        })
+    }
+
+    fn step(&mut self, op: &QOp, scratch: Option<TensorId>) -> Result<Step> {
+        let kernel = KernelId::Direct;
+        Ok(match op {
+            QOp::Conv2d { input, output, window, groups, weights, padding_codes, rescale } => Step::Conv2d(Conv2d {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                window: *window,
+                groups: *groups,
+                kernel,
+                weights: self.constants.push(weights)?,
+                padding_codes: self.constants.push(padding_codes)?,
+                rescale: self.rescale(rescale)?,
+                scratch,
+            }),
+            QOp::Linear { input, output, weights, wide, rescale } => Step::Linear(Linear {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                kernel,
+                weights: self.constants.push(weights)?,
+                wide: *wide,
+                rescale: self.rescale(rescale)?,
+                scratch,
+            }),
+            QOp::MaxPool { input, output, window } => {
+                Step::MaxPool(MaxPool { input: tensor_id(*input)?, output: tensor_id(*output)?, window: *window })
+            }
+            QOp::AveragePool { input, output, window, input_zero_point, requant, zero_point, clamp } => {
+                Step::AveragePool(AveragePool {
+                    input: tensor_id(*input)?,
+                    output: tensor_id(*output)?,
+                    window: *window,
+                    input_zero_point: *input_zero_point,
+                    requant: *requant,
+                    zero_point: *zero_point,
+                    clamp: *clamp,
+                })
+            }
+            QOp::GlobalPool { first, second, output, shift, zero_point, clamp } => Step::GlobalPool(GlobalPool {
+                first: term(first)?,
+                second: second.as_ref().map(term).transpose()?,
+                output: tensor_id(*output)?,
+                shift: *shift,
+                zero_point: *zero_point,
+                clamp: *clamp,
+            }),
+            QOp::Add { first, second, output, shift, zero_point, clamp } => Step::Add(Add {
+                first: term(first)?,
+                second: term(second)?,
+                output: tensor_id(*output)?,
+                shift: *shift,
+                zero_point: *zero_point,
+                clamp: *clamp,
+            }),
+            QOp::Requantize { input, output, input_zero_point, requant, zero_point, clamp } => {
+                Step::Requantize(Requantize {
+                    input: tensor_id(*input)?,
+                    output: tensor_id(*output)?,
+                    input_zero_point: *input_zero_point,
+                    requant: *requant,
+                    zero_point: *zero_point,
+                    clamp: *clamp,
+                })
+            }
+            QOp::ResizeBilinear { input, residual, output, rows, columns, weight_bits, shift, zero_point, clamp } => {
+                Step::ResizeBilinear(ResizeBilinear {
+                    input: term(input)?,
+                    residual: residual.as_ref().map(term).transpose()?,
+                    output: tensor_id(*output)?,
+                    rows: self.constants.push(rows)?,
+                    columns: self.constants.push(columns)?,
+                    weight_bits: *weight_bits,
+                    shift: *shift,
+                    zero_point: *zero_point,
+                    clamp: *clamp,
+                })
+            }
+            QOp::Tokens {
+                first,
+                second,
+                velocity,
+                output,
+                velocity_multipliers,
+                position,
+                shift,
+                zero_point,
+                clamp,
+            } => Step::Tokens(Tokens {
+                first: token_source(first)?,
+                second: token_source(second)?,
+                velocity: tensor_id(*velocity)?,
+                output: tensor_id(*output)?,
+                velocity_multipliers: self.constants.push(velocity_multipliers)?,
+                position: self.constants.push(position)?,
+                shift: *shift,
+                zero_point: *zero_point,
+                clamp: *clamp,
+            }),
+            QOp::LayerNorm { input, output, first_row, epsilon, gains, offsets, shift, zero_point, clamp } => {
+                Step::LayerNorm(LayerNorm {
+                    input: tensor_id(*input)?,
+                    output: tensor_id(*output)?,
+                    first_row: *first_row,
+                    epsilon: *epsilon,
+                    gains: self.constants.push(gains)?,
+                    offsets: self.constants.push(offsets)?,
+                    shift: *shift,
+                    zero_point: *zero_point,
+                    clamp: *clamp,
+                })
+            }
+            QOp::Attention { query, key, value, output, heads, exponent, exp_table, requant, zero_point, clamp } => {
+                Step::Attention(Attention {
+                    query: tensor_id(*query)?,
+                    key: tensor_id(*key)?,
+                    value: tensor_id(*value)?,
+                    output: tensor_id(*output)?,
+                    heads: *heads,
+                    exponent: *exponent,
+                    exp_table: self.constants.push(exp_table)?,
+                    requant: *requant,
+                    zero_point: *zero_point,
+                    clamp: *clamp,
+                    scratch,
+                })
+            }
+            QOp::WaypointDecoder(decoder) => Step::WaypointDecoder(self.waypoint_decoder(decoder, scratch)?),
+        })
+    }
+
+    fn waypoint_decoder(&mut self, d: &QWaypointDecoder, scratch: Option<TensorId>) -> Result<WaypointDecoder> {
+        Ok(WaypointDecoder {
+            hidden: tensor_id(d.hidden)?,
+            goal: tensor_id(d.goal)?,
+            output: tensor_id(d.output)?,
+            hidden_fraction_bits: d.hidden_fraction_bits,
+            concat: d.concat,
+            input_weights: self.constants.push(&d.input_weights)?,
+            hidden_weights: self.constants.push(&d.hidden_weights)?,
+            input_pre_shift: d.input_pre_shift,
+            hidden_pre_shift: d.hidden_pre_shift,
+            input_multipliers: self.constants.push(&d.input_multipliers)?,
+            hidden_multipliers: self.constants.push(&d.hidden_multipliers)?,
+            shifts: self.constants.push(&d.shifts)?,
+            biases: self.constants.push(&d.biases)?,
+            output_weights: self.constants.push(&d.output_weights)?,
+            output_bias: self.constants.push(&d.output_bias)?,
+            output_pre_shift: d.output_pre_shift,
+            output_requant: d.output_requant,
+            tanh_table: self.constants.push(&d.tanh_table)?,
+            scratch,
+        })
+    }
+}

@@ -280,6 +280,35 @@ impl QModel {
 }
 
 impl QOp {
+    /// Operator name as reports print it.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Conv2d { .. } => "conv2d",
+            Self::Linear { .. } => "linear",
+            Self::MaxPool { .. } => "max_pool",
+            Self::AveragePool { .. } => "average_pool",
+            Self::GlobalPool { .. } => "global_pool",
+            Self::Add { .. } => "add",
+            Self::Requantize { .. } => "requantize",
+            Self::ResizeBilinear { .. } => "resize_bilinear",
+            Self::Tokens { .. } => "tokens",
+            Self::LayerNorm { .. } => "layer_norm",
+            Self::Attention { .. } => "attention",
+            Self::WaypointDecoder(_) => "waypoint_decoder",
+        }
+    }
+
+    /// Bytes of the weights (not bias, multipliers or tables).
+    pub fn weight_bytes(&self) -> u64 {
+        match self {
+            Self::Conv2d { weights, .. } | Self::Linear { weights, .. } => weights.len() as u64,
+            Self::WaypointDecoder(d) => {
+                2 * (d.input_weights.len() + d.hidden_weights.len() + d.output_weights.len()) as u64
+            }
+            _ => 0,
+        }
+    }
+
     /// Tensors read, each once, in operand order (residual last).
     pub fn reads(&self) -> Vec<QTensorId> {
         fn residual(rescale: &QRescale) -> Option<QTensorId> {

@@ -1,1 +1,5 @@
 //! Support for the integration tests.
+
+pub mod build;
+pub mod golden;
+pub mod torch_file;

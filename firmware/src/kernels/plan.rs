@@ -1,35 +1,179 @@
 //! What the kernels need, as pure functions shared with the compiler: scratch sizes and in-place rules.
 
+use super::portable::Axis;
 use crate::program::{KernelId, Window};
 use crate::tensor::{ElementType, Shape};
 
-/// Scratch of a convolution, bytes.
+/// Rows (output pixels, positions) that the portable product works on at once.
+pub const TILE_ROWS: u32 = 4;
+
+/// Scratch of a convolution, bytes: the windows of up to [`TILE_ROWS`] output pixels in one group, widened to `i16`.
 pub const fn conv2d_scratch_bytes(kernel: KernelId, input: Shape, output: Shape, window: Window, groups: u16) -> u32 {
-    let _ = (kernel, input, output, window, groups);
-    0
+    let KernelId::Direct = kernel;
+    if groups == 0 {
+        return 0;
+    }
+    let depth = window.kernel_h as u64 * window.kernel_w as u64 * (input.channels / groups) as u64;
+    let positions = output.positions();
+    let rows = if positions < TILE_ROWS { positions } else { TILE_ROWS };
+    saturate(2 * rows as u64 * depth)
 }
 
-/// Scratch of a linear layer, bytes.
+/// Scratch of a linear layer, bytes: [`TILE_ROWS`] rows of an `i8` input, widened to `i16`; none for `i16` input.
 pub const fn linear_scratch_bytes(kernel: KernelId, inputs: u16, outputs: u16, input: ElementType) -> u32 {
-    let _ = (kernel, inputs, outputs, input);
-    0
+    let KernelId::Direct = kernel;
+    let _ = outputs;
+    match input {
+        ElementType::I8 => 2 * TILE_ROWS * inputs as u32,
+        ElementType::I16 | ElementType::I32 | ElementType::Scratch => 0,
+    }
 }
 
-/// Scratch of attention, bytes.
+/// Scratch of attention, bytes: for one query row of one head the logits (`i32`, one per key), the context sums
+/// (`i32`, one per channel of the head) and the widened query (`i16`).
 pub const fn attention_scratch_bytes(tokens: u32, channels: u16, heads: u16) -> u32 {
-    let _ = (tokens, channels, heads);
-    0
+    if heads == 0 {
+        return 0;
+    }
+    saturate(4 * tokens as u64 + 6 * (channels / heads) as u64)
 }
 
-/// Scratch of the waypoint decoder, bytes.
+/// Scratch of the waypoint decoder, bytes: two hidden states of `i16`.
 pub const fn waypoint_decoder_scratch_bytes(hidden_size: u16) -> u32 {
-    let _ = hidden_size;
-    0
+    4 * hidden_size as u32
 }
 
 /// Whether a max pool may write its output over the front of its input: in raster order no output element may land on
 /// an input element that a later output still reads.
+///
+/// Output pixel `(y, x)` is written when `y·W_out + x` pixels have been; so its window must not begin before input pixel
+/// `y·W_out + x`. (An element may land on one that its own window reads: the kernel reads first.)
 pub fn max_pool_in_place(input: Shape, output: Shape, window: Window) -> bool {
-    let _ = (input, output, window);
-    false
+    if input.channels != output.channels || output.elements() > input.elements() {
+        return false;
+    }
+    let (rows, columns) = (Axis::rows(&window, input), Axis::columns(&window, input));
+    let lead = |axis: Axis, index: u16| axis.taps(usize::from(index)).next();
+    // The column that is furthest behind decides: the least of first tap − x.
+    let Some(column_lead) = (0..output.width).filter_map(|x| Some(signed(lead(columns, x)?) - i64::from(x))).min()
+    else {
+        return true; // no window reads anything
+    };
+    (0..output.height).all(|y| {
+        let Some(first_row) = lead(rows, y) else { return true };
+        let written = i64::from(y) * i64::from(output.width);
+        signed(first_row) * i64::from(input.width) + column_lead >= written
+    })
+}
+
+/// An index below 2^16 + 2^8, signed.
+fn signed(index: usize) -> i64 {
+    i64::try_from(index).unwrap_or(i64::MAX)
+}
+
+const fn saturate(bytes: u64) -> u32 {
+    if bytes > u32::MAX as u64 { u32::MAX } else { bytes as u32 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Simulates the raster order: output pixel i overwrites input pixel i; is a pixel ever read after that?
+    fn never_reads_overwritten(input: Shape, output: Shape, window: Window) -> bool {
+        let axis = |out: u16, tap: u8, stride: u8, dilation: u8, pad: u8, size: u16| {
+            let at = i32::from(out) * i32::from(stride) + i32::from(tap) * i32::from(dilation) - i32::from(pad);
+            (0..i32::from(size)).contains(&at).then_some(at)
+        };
+        let mut written = 0;
+        for y in 0..output.height {
+            for x in 0..output.width {
+                for ky in 0..window.kernel_h {
+                    for kx in 0..window.kernel_w {
+                        let row = axis(y, ky, window.stride_h, window.dilation_h, window.pad_top, input.height);
+                        let column = axis(x, kx, window.stride_w, window.dilation_w, window.pad_left, input.width);
+                        if let (Some(row), Some(column)) = (row, column)
+                            && row * i32::from(input.width) + column < written
+                        {
+                            return false;
+                        }
+                    }
+                }
+                written += 1;
+            }
+        }
+        output.elements() <= input.elements()
+    }
+
+    #[test]
+    fn max_pool_in_place_equals_a_simulation() {
+        let (mut allowed, mut forbidden) = (0, 0);
+        let digits = |code: u32| [code % 3, code / 3 % 3, code / 9 % 3, code / 27 % 3].map(|d| d as u8);
+        for code in 0..81 * 27 {
+            let [kernel_h, kernel_w, stride_h, stride_w] = digits(code % 81).map(|d| d + 1);
+            let [pad_top, pad_left, dilation, _] = digits(code / 81);
+            let window = Window {
+                kernel_h,
+                kernel_w,
+                stride_h,
+                stride_w,
+                pad_top,
+                pad_bottom: pad_top,
+                pad_left,
+                pad_right: pad_left.saturating_sub(1),
+                dilation_h: dilation + 1,
+                dilation_w: 1 + dilation % 2,
+            };
+            for (height, width) in [(1, 1), (1, 5), (4, 1), (2, 3), (3, 2), (5, 4), (4, 7)] {
+                let Some((out_height, out_width)) = window.output_size(height, width) else { continue };
+                let (input, output) = (Shape::map(height, width, 2), Shape::map(out_height, out_width, 2));
+                let expected = never_reads_overwritten(input, output, window);
+                assert_eq!(max_pool_in_place(input, output, window), expected, "{input:?} {window:?}");
+                *(if expected { &mut allowed } else { &mut forbidden }) += 1;
+            }
+        }
+        assert!(allowed > 1000 && forbidden > 1000, "{allowed} allowed, {forbidden} forbidden");
+    }
+
+    #[test]
+    fn transfusers_stem_pool_may_run_in_place() {
+        let window = Window {
+            kernel_h: 3,
+            kernel_w: 3,
+            stride_h: 2,
+            stride_w: 2,
+            pad_top: 1,
+            pad_bottom: 1,
+            pad_left: 1,
+            pad_right: 1,
+            dilation_h: 1,
+            dilation_w: 1,
+        };
+        assert!(max_pool_in_place(Shape::map(128, 128, 64), Shape::map(64, 64, 64), window));
+        assert!(!max_pool_in_place(Shape::map(128, 128, 64), Shape::map(64, 64, 32), window), "channels differ");
+    }
+
+    #[test]
+    fn scratch_of_hostile_shapes_is_a_number() {
+        let all = Shape::map(u16::MAX, u16::MAX, u16::MAX);
+        let window = Window {
+            kernel_h: 255,
+            kernel_w: 255,
+            stride_h: 0,
+            stride_w: 0,
+            pad_top: 255,
+            pad_bottom: 255,
+            pad_left: 255,
+            pad_right: 255,
+            dilation_h: 255,
+            dilation_w: 255,
+        };
+        assert_eq!(conv2d_scratch_bytes(KernelId::Direct, all, all, window, 1), u32::MAX);
+        assert_eq!(conv2d_scratch_bytes(KernelId::Direct, all, all, window, 0), 0);
+        assert_eq!(attention_scratch_bytes(u32::MAX, u16::MAX, 1), u32::MAX);
+        assert_eq!(attention_scratch_bytes(1, 1, 0), 0);
+        assert_eq!(linear_scratch_bytes(KernelId::Direct, u16::MAX, 1, ElementType::I8), 8 * 65535);
+        assert_eq!(waypoint_decoder_scratch_bytes(u16::MAX), 4 * 65535);
+        assert!(!max_pool_in_place(all, all, Window { stride_h: 0, ..window }));
+    }
 }

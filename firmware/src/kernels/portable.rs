@@ -1,11 +1,21 @@
 //! The norm: plain Rust for any target, one operator per file.
+//!
+//! Every kernel returns early, writing nothing, where operands do not have the lengths that their arguments say; an
+//! image that passed `Image::parse` never takes that path.
 
 pub mod attention;
+mod axis;
+mod codes;
 pub mod conv2d;
 pub mod elementwise;
 pub mod layer_norm;
 pub mod linear;
+#[cfg(test)]
+mod oracle;
 pub mod pool;
+mod product;
 pub mod resize_bilinear;
 pub mod tokens;
 pub mod waypoint_decoder;
+
+pub(crate) use axis::Axis;

@@ -1,6 +1,126 @@
 //! Shape rules and the checklist of graph invariants.
 
-use super::{Op, Shape};
+use super::{Graph, Node, Op, Shape, ValueId};
+use std::collections::HashSet;
+
+/// Checks every invariant of the [module page](super) and of the names, and collects all violations.
+///
+/// * handles are in range; each value is written at most once, and read only after it was written
+/// * the output shapes are those that the operators give; no dimension is zero
+/// * constants have as many elements as their shape says and are finite; variances and deviations are positive
+/// * every value has a name of its own, and its node has the same
+/// * there are outputs, and they are written
+///
+/// # Errors
+/// One line per violation, led by the node.
+pub fn verify(graph: &Graph) -> Result<(), Vec<String>> {
+    let mut checklist = Checklist { graph, written: HashSet::new(), errors: Vec::new() };
+    for node in &graph.nodes {
+        checklist.node(node);
+    }
+    checklist.outputs();
+    checklist.names();
+    if checklist.errors.is_empty() { Ok(()) } else { Err(checklist.errors) }
+}
+
+struct Checklist<'a> {
+    graph: &'a Graph,
+    written: HashSet<ValueId>,
+    errors: Vec<String>,
+}
+
+impl Checklist<'_> {
+    fn error(&mut self, node: &Node, message: impl std::fmt::Display) {
+        self.errors.push(format!("{} {}: {message}", node.op.name(), node.name));
+    }
+
+    fn node(&mut self, node: &Node) {
+        for &input in &node.inputs {
+            if !self.written.contains(&input) {
+                self.error(node, format!("reads value {} before it is written", input.0));
+            }
+        }
+        match self.graph.values.get(node.output.0 as usize) {
+            None => self.error(node, format!("writes value {}, which does not exist", node.output.0)),
+            Some(value) if value.name != node.name => {
+                self.error(node, format!("writes the value named {}", value.name));
+            }
+            Some(_) => {}
+        }
+        if !self.written.insert(node.output) {
+            self.error(node, format!("writes value {} a second time", node.output.0));
+        }
+        self.shape(node);
+        self.constants(node);
+    }
+
+    fn shape(&mut self, node: &Node) {
+        let shape = |id: &ValueId| self.graph.values.get(id.0 as usize).map(|v| v.shape);
+        let (Some(output), Some(inputs)) =
+            (shape(&node.output), node.inputs.iter().map(shape).collect::<Option<Vec<_>>>())
+        else {
+            return;
+        };
+        if output.elements() == 0 {
+            self.error(node, format!("{output:?} is empty"));
+        }
+        if let Op::Input(_) = node.op {
+            if !inputs.is_empty() {
+                self.error(node, "an input has operands");
+            }
+            return;
+        }
+        match node.op.output_shape(&inputs) {
+            Err(message) => self.error(node, message),
+            Ok(expected) if expected != output => {
+                self.error(node, format!("output: found {output:?}, expected {expected:?}"));
+            }
+            Ok(_) => {}
+        }
+    }
+
+    fn constants(&mut self, node: &Node) {
+        for constant in node.op.constants() {
+            let (what, data) = (constant.what, constant.data);
+            if let Some(shape) = constant.shape {
+                let count = shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
+                if count != Some(data.len()) {
+                    self.error(node, format!("{what}: found {} values for {shape:?}", data.len()));
+                }
+            }
+            if let Some(i) = data.iter().position(|v| !v.is_finite()) {
+                self.error(node, format!("{what}: {} at index {i}", data[i]));
+            }
+        }
+        let (what, divisors) = match &node.op {
+            Op::BatchNorm(bn) => ("variance + ε", bn.variance.iter().map(|v| v + bn.epsilon).collect()),
+            Op::Normalize(n) => ("standard deviation", n.std.clone()),
+            Op::Conv2d(c) => ("standard deviation", c.normalization.as_ref().map_or(vec![], |n| n.std.clone())),
+            _ => return,
+        };
+        if let Some(i) = divisors.iter().position(|&v| v <= 0.0) {
+            self.error(node, format!("{what}: {} at index {i}", divisors[i]));
+        }
+    }
+
+    fn outputs(&mut self) {
+        if self.graph.outputs.is_empty() {
+            self.errors.push("the graph has no outputs".into());
+        }
+        for output in self.graph.outputs.iter().filter(|o| !self.written.contains(o)) {
+            self.errors.push(format!("output value {} is never written", output.0));
+        }
+    }
+
+    fn names(&mut self) {
+        let mut names = HashSet::new();
+        for value in &self.graph.values {
+            if value.name.is_empty() || !names.insert(&value.name) {
+                self.errors.push(format!("value name '{}' is empty or not unique", value.name));
+            }
+        }
+    }
+}
 
 fn arity(op: &Op, inputs: &[Shape], allowed: std::ops::RangeInclusive<usize>) -> Result<(), String> {
     if allowed.contains(&inputs.len()) {
@@ -177,5 +297,61 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
             expect("goal values", inputs[1].elements() as usize, 2)?;
             Ok(Shape::tokens(d.steps, 2))
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ir::{InputKind, Linear, Weights};
+    use std::sync::Arc;
+
+    fn linear(outputs: usize, inputs: usize, value: f32) -> Op {
+        let weights = Arc::new(Weights { shape: vec![outputs, inputs], data: vec![value; outputs * inputs] });
+        Op::Linear(Linear { weights, bias: None, relu: false })
+    }
+
+    fn small() -> Graph {
+        let mut graph = Graph::default();
+        let x = graph.push_input("x", InputKind::Goal, Shape::vector(2));
+        let a = graph.push("a", linear(3, 2, 1.0), &[x]).unwrap();
+        let b = graph.push("b", Op::Relu, &[a]).unwrap();
+        graph.outputs.push(b);
+        graph
+    }
+
+    #[test]
+    fn sound_graph_passes() {
+        assert_eq!(verify(&small()), Ok(()));
+    }
+
+    #[test]
+    fn all_violations_are_collected() {
+        let mut graph = small();
+        graph.nodes.swap(1, 2);
+        graph.nodes[2].op = linear(4, 2, f32::NAN);
+        graph.values[2].name = "a".into();
+        graph.outputs.push(ValueId(9));
+        assert_eq!(
+            verify(&graph).unwrap_err(),
+            [
+                "relu b: reads value 1 before it is written",
+                "relu b: writes the value named a",
+                "linear a: output: found Shape { height: 1, width: 1, channels: 3 }, \
+                 expected Shape { height: 1, width: 1, channels: 4 }",
+                "linear a: weights: NaN at index 0",
+                "output value 9 is never written",
+                "value name 'a' is empty or not unique",
+            ]
+        );
+    }
+
+    #[test]
+    fn value_written_twice_and_missing_outputs_are_found() {
+        let mut graph = small();
+        graph.nodes[2].output = ValueId(1);
+        graph.nodes[2].name = "a".into();
+        graph.outputs.clear();
+        assert_eq!(verify(&graph).unwrap_err(), ["relu a: writes value 1 a second time", "the graph has no outputs"]);
     }
 }

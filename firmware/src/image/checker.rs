@@ -1,0 +1,109 @@
+//! All bytes of an image against its CRCs, in slices as small as the caller's time allows.
+
+use super::{Image, SectionKind};
+use core::fmt;
+use crc::{CRC_32_ISO_HDLC, Crc, Digest, Table};
+
+static CRC: Crc<u32, Table<1>> = Crc::<u32, Table<1>>::new(&CRC_32_ISO_HDLC);
+
+/// CRC-32 (ISO-HDLC, the one of zip and Ethernet) of some bytes.
+pub fn crc32(bytes: &[u8]) -> u32 {
+    CRC.checksum(bytes)
+}
+
+/// A section is damaged.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub struct CheckError {
+    /// The section.
+    pub section: SectionKind,
+    /// CRC-32 of its bytes.
+    pub found: u32,
+    /// CRC-32 in the header.
+    pub expected: u32,
+}
+
+impl fmt::Display for CheckError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { section, found, expected } = self;
+        write!(f, "{} section: damaged: CRC {found:08x}, expected {expected:08x}", section.name())
+    }
+}
+
+impl core::error::Error for CheckError {}
+
+/// How far a check is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum CheckProgress {
+    /// Bytes remain.
+    Running {
+        /// Bytes read so far.
+        checked: u32,
+    },
+    /// Every section agrees with its CRC.
+    Done,
+}
+
+/// A check under way; see [`Image::check`] for the whole in one call.
+pub struct Checker<'a> {
+    image: Image<'a>,
+    section: usize,
+    /// Bytes of the current section that are read.
+    position: usize,
+    digest: Digest<'static, u32, Table<1>>,
+    checked: u32,
+}
+
+impl fmt::Debug for Checker<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Checker").field("section", &self.section).field("position", &self.position).finish()
+    }
+}
+
+impl<'a> Checker<'a> {
+    /// Begins with the first section (the header's own CRC is checked by `parse`).
+    pub fn new(image: &Image<'a>) -> Self {
+        Self { image: *image, section: 0, position: 0, digest: CRC.digest(), checked: 0 }
+    }
+
+    /// Reads at most `max_bytes` more bytes (at least 1).
+    ///
+    /// # Errors
+    /// The first section that is damaged; calling on after that starts with the next section.
+    pub fn advance(&mut self, max_bytes: usize) -> Result<CheckProgress, CheckError> {
+        let mut budget = max_bytes.max(1);
+        while let Some(kind) = SectionKind::ALL.get(self.section).copied() {
+            let section = self.image.padded_section(kind);
+            let rest = section.get(self.position..).unwrap_or_default();
+            let slice = rest.get(..budget.min(rest.len())).unwrap_or_default();
+            self.digest.update(slice);
+            self.position = self.position.saturating_add(slice.len());
+            self.checked = self.checked.saturating_add(u32::try_from(slice.len()).unwrap_or(u32::MAX));
+            budget = budget.saturating_sub(slice.len());
+            if slice.len() < rest.len() {
+                return Ok(CheckProgress::Running { checked: self.checked });
+            }
+            self.finish_section(kind)?;
+        }
+        Ok(CheckProgress::Done)
+    }
+
+    fn finish_section(&mut self, section: SectionKind) -> Result<(), CheckError> {
+        let found = core::mem::replace(&mut self.digest, CRC.digest()).finalize();
+        self.section = self.section.saturating_add(1);
+        self.position = 0;
+        let expected = self.image.section_crc(section);
+        if found == expected { Ok(()) } else { Err(CheckError { section, found, expected }) }
+    }
+}
+
+impl Image<'_> {
+    /// Compares every section with its CRC. The self-test of the engine then proves the arithmetic.
+    ///
+    /// # Errors
+    /// The first section that is damaged.
+    pub fn check(&self) -> Result<(), CheckError> {
+        Checker::new(self).advance(usize::MAX).map(|_| ())
+    }
+}

@@ -1,0 +1,171 @@
+//! What each choice of the quantizer is worth: one model, quantized with one choice switched off at a time.
+//!
+//! The f64 model stands for the engine, since their bytes are equal; nothing has to be compiled.
+
+use model_compiler::calibrate::{Statistics, calibrate};
+use model_compiler::error::{Error, ErrorCode, Result};
+use model_compiler::frames::Frame;
+use model_compiler::integer_reference;
+use model_compiler::ir::{Graph, Op};
+use model_compiler::passes::PassOptions;
+use model_compiler::pipeline;
+use model_compiler::qmodel::QModel;
+use model_compiler::quantize::{QuantizeOptions, RangeRule, SkipStages, quantize};
+use model_compiler::reference;
+
+/// One way to quantize.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Variant {
+    /// What tables call it.
+    pub name: &'static str,
+    /// Choices of the quantizer.
+    pub quantize: QuantizeOptions,
+    /// Choices of the passes.
+    pub passes: PassOptions,
+}
+
+/// What a variant reaches over all evaluation frames.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Fidelity {
+    /// SQNR of the pooled global vector, dB: power sums over all frames.
+    pub vector_sqnr_db: f64,
+    /// Mean distance from the f32 waypoint, per waypoint, millimeters.
+    pub mean_mm: Vec<f64>,
+    /// Largest distance, per waypoint, millimeters.
+    pub worst_mm: Vec<f64>,
+}
+
+/// The default with 8-bit and with 16-bit skip values, and the former without one choice each.
+pub fn variants() -> Vec<Variant> {
+    let base = QuantizeOptions::default();
+    let passes = PassOptions::default();
+    let variant = |name, quantize: QuantizeOptions| Variant { name, quantize, passes };
+    vec![
+        variant("8-bit maps", base.clone()),
+        variant("16-bit skip streams", QuantizeOptions { skip: SkipStages::wide(), ..base.clone() }),
+        variant("without 16-bit token streams", QuantizeOptions { wide_stream: false, ..base.clone() }),
+        variant("without own pool scale", QuantizeOptions { own_pool_scale: false, ..base.clone() }),
+        Variant {
+            name: "without fused residual",
+            quantize: base.clone(),
+            passes: PassOptions { fuse_residual: false },
+        },
+        variant("without MSE ranges", QuantizeOptions { ranges: RangeRule::MinMax, ..base.clone() }),
+        variant("without bias correction", QuantizeOptions { bias_correction: false, ..base }),
+    ]
+}
+
+/// A graph with its statistics and what f32 gives for the evaluation frames.
+#[derive(Debug)]
+pub struct Bench<'a> {
+    graph: Graph,
+    statistics: Statistics,
+    evaluation: &'a [Frame],
+    /// Per frame: the pooled vector and the waypoints.
+    expected: Vec<[Vec<f32>; 2]>,
+}
+
+impl<'a> Bench<'a> {
+    /// Calibrates a graph and runs f32 on the evaluation frames.
+    ///
+    /// # Errors
+    /// No pooled vector in the graph, or frames that it does not accept.
+    pub fn new(graph: Graph, calibration: &[Frame], evaluation: &'a [Frame]) -> Result<Self> {
+        let vector = vector_name(&graph)?.to_owned();
+        let statistics = calibrate(&graph, &pipeline::raw_inputs(&graph, calibration)?, |_, _| {})?;
+        let mut expected = Vec::with_capacity(evaluation.len());
+        for inputs in pipeline::raw_inputs(&graph, evaluation)? {
+            let mut seen = Vec::new();
+            let outputs = reference::run(&graph, &inputs, |node, data| {
+                if node.name == vector {
+                    seen = data.to_vec();
+                }
+            })?;
+            expected.push([seen, outputs.into_iter().next().unwrap_or_default()]);
+        }
+        Ok(Self { graph, statistics, evaluation, expected })
+    }
+
+    /// Quantizes with these choices and evaluates. `progress` is called after each frame with the number done.
+    ///
+    /// # Errors
+    /// The quantizer refuses the choices.
+    pub fn measure(&self, options: &QuantizeOptions, mut progress: impl FnMut(usize)) -> Result<Fidelity> {
+        let model = quantize(&self.graph, &self.statistics, options)?;
+        let mut sums = Sums::default();
+        for (index, (frame, expected)) in self.evaluation.iter().zip(&self.expected).enumerate() {
+            let [vector, waypoints] = self.integers(&model, frame)?;
+            sums.add_vector(&expected[0], &vector);
+            sums.add_waypoints(&expected[1], &waypoints);
+            progress(index + 1);
+        }
+        Ok(sums.finish())
+    }
+
+    fn integers(&self, model: &QModel, frame: &Frame) -> Result<[Vec<f64>; 2]> {
+        let vector = vector_name(&self.graph)?;
+        let inputs = encode(model, frame)?;
+        let mut seen = Vec::new();
+        let outputs = integer_reference::run(model, &inputs, |_, step, codes| {
+            let tensor = model.tensor(step.op.output());
+            if tensor.value == vector {
+                seen = codes.iter().map(|c| (c - f64::from(tensor.zero_point)) * tensor.scale).collect();
+            }
+        })?;
+        let scale = model.tensor(model.outputs[0].tensor).scale;
+        Ok([seen, outputs[0].iter().map(|c| c * scale).collect()])
+    }
+}
+
+/// Input codes of a frame, by the f64 model's own rules.
+///
+/// # Errors
+/// The frame lacks an input of the model.
+pub fn encode(model: &QModel, frame: &Frame) -> Result<Vec<Vec<f64>>> {
+    let kinds = model.inputs.iter().filter_map(|port| port.kind);
+    kinds
+        .map(|kind| {
+            let raw: Vec<f64> = frame.raw(kind)?.into_iter().map(f64::from).collect();
+            Ok(integer_reference::encode_input(kind, &raw))
+        })
+        .collect()
+}
+
+fn vector_name(graph: &Graph) -> Result<&str> {
+    let pool = graph.nodes.iter().rfind(|node| matches!(node.op, Op::GlobalPool));
+    pool.map(|node| node.name.as_str())
+        .ok_or_else(|| Error::new(ErrorCode::Unsupported, &graph.name, "found no global pool to measure at"))
+}
+
+#[derive(Default)]
+struct Sums {
+    signal: f64,
+    noise: f64,
+    distances: Vec<Vec<f64>>,
+}
+
+impl Sums {
+    fn add_vector(&mut self, expected: &[f32], found: &[f64]) {
+        for (&e, f) in expected.iter().zip(found) {
+            self.signal += f64::from(e).powi(2);
+            self.noise += (f64::from(e) - f).powi(2);
+        }
+    }
+
+    fn add_waypoints(&mut self, expected: &[f32], found: &[f64]) {
+        let pairs = expected.chunks_exact(2).zip(found.chunks_exact(2));
+        self.distances.resize(expected.len() / 2, Vec::new());
+        for ((e, f), distances) in pairs.zip(&mut self.distances) {
+            distances.push(1e3 * (f64::from(e[0]) - f[0]).hypot(f64::from(e[1]) - f[1]));
+        }
+    }
+
+    fn finish(self) -> Fidelity {
+        let mean = |d: &Vec<f64>| d.iter().sum::<f64>() / d.len() as f64;
+        Fidelity {
+            vector_sqnr_db: 10.0 * (self.signal / self.noise).log10(),
+            mean_mm: self.distances.iter().map(mean).collect(),
+            worst_mm: self.distances.iter().map(|d| d.iter().copied().fold(0.0, f64::max)).collect(),
+        }
+    }
+}

@@ -1,0 +1,100 @@
+//! From stored bytes to integer codes and real values, and what a code's bounds are.
+
+use firmware::program::Clamp;
+use firmware::tensor::ElementType;
+use model_compiler::qmodel::{QOp, QTensor};
+
+/// The integers behind little-endian element bytes. Scratch bytes count as unsigned.
+pub fn decode(bytes: &[u8], element: ElementType) -> Vec<i32> {
+    match element {
+        ElementType::I8 => bytes.iter().map(|&b| i32::from(b.cast_signed())).collect(),
+        ElementType::I16 => bytes.as_chunks::<2>().0.iter().map(|&b| i32::from(i16::from_le_bytes(b))).collect(),
+        ElementType::I32 => bytes.as_chunks::<4>().0.iter().map(|&b| i32::from_le_bytes(b)).collect(),
+        ElementType::Scratch => bytes.iter().map(|&b| i32::from(b)).collect(),
+    }
+}
+
+/// `scale · (code − zero_point)` of every code of a tensor.
+pub fn dequantize(tensor: &QTensor, codes: &[i32]) -> Vec<f32> {
+    let real = |&code: &i32| (tensor.scale * (f64::from(code) - f64::from(tensor.zero_point))) as f32;
+    codes.iter().map(real).collect()
+}
+
+/// The output bounds at which codes saturate. A lower bound equal to the zero point is a ReLU and no loss: `None`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct SaturationBounds {
+    min: Option<i16>,
+    max: i16,
+}
+
+impl SaturationBounds {
+    /// The bounds of an operator; `None` where its output cannot saturate (copies, waypoints).
+    pub fn of(op: &QOp) -> Option<Self> {
+        let (clamp, zero_point) = match op {
+            QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } => (rescale.clamp, rescale.zero_point),
+            QOp::AveragePool { clamp, zero_point, .. }
+            | QOp::GlobalPool { clamp, zero_point, .. }
+            | QOp::Add { clamp, zero_point, .. }
+            | QOp::Requantize { clamp, zero_point, .. }
+            | QOp::ResizeBilinear { clamp, zero_point, .. }
+            | QOp::Tokens { clamp, zero_point, .. }
+            | QOp::LayerNorm { clamp, zero_point, .. }
+            | QOp::Attention { clamp, zero_point, .. } => (*clamp, *zero_point),
+            QOp::MaxPool { .. } | QOp::WaypointDecoder(_) => return None,
+        };
+        let Clamp { min, max } = clamp;
+        Some(Self { min: (min != zero_point).then_some(min), max })
+    }
+
+    /// How many codes lie at a bound.
+    pub fn count(&self, codes: &[i32]) -> u64 {
+        let at_bound =
+            |&&code: &&i32| code == i32::from(self.max) || self.min.is_some_and(|min| code == i32::from(min));
+        codes.iter().filter(at_bound).count() as u64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use firmware::program::Requant;
+    use firmware::tensor::Shape;
+    use model_compiler::qmodel::QTensorId;
+
+    #[test]
+    fn elements_are_little_endian_and_signed() {
+        assert_eq!(decode(&[0x80, 0xff, 1], ElementType::I8), [-128, -1, 1]);
+        assert_eq!(decode(&[0xfe, 0xff, 2, 1], ElementType::I16), [-2, 258]);
+        assert_eq!(decode(&[0, 0, 0xff, 0xff], ElementType::I32), [-65536]);
+    }
+
+    #[test]
+    fn real_values_follow_scale_and_zero_point() {
+        let tensor = QTensor {
+            name: "t".into(),
+            value: "t".into(),
+            shape: Shape::vector(2),
+            element: ElementType::I8,
+            scale: 0.5,
+            zero_point: -128,
+            saturation_ppm: None,
+        };
+        assert_eq!(dequantize(&tensor, &[-128, 127]), [0.0, 127.5]);
+    }
+
+    #[test]
+    fn the_relu_bound_is_not_saturation() {
+        let op = |zero_point, min| QOp::Requantize {
+            input: QTensorId(0),
+            output: QTensorId(1),
+            input_zero_point: 0,
+            requant: Requant { multiplier: 1 << 23, shift: 23 },
+            zero_point,
+            clamp: Clamp { min, max: 127 },
+        };
+        let codes = [-128, -128, 0, 5, 127];
+        assert_eq!(SaturationBounds::of(&op(-128, -128)).unwrap().count(&codes), 1);
+        assert_eq!(SaturationBounds::of(&op(0, -128)).unwrap().count(&codes), 3);
+        assert_eq!(SaturationBounds::of(&op(5, 5)).unwrap().count(&codes), 1);
+    }
+}

@@ -1,0 +1,172 @@
+//! The files of a run: image, record, checkpoint, frames.
+
+use firmware::image::{Image, layout};
+use model_compiler::artifact;
+use model_compiler::emit::AlignedBytes;
+use model_compiler::error::{Error, ErrorCode, Result};
+use model_compiler::frames::{self, Frame, FrameFormat};
+use model_compiler::import::ImportOptions;
+use model_compiler::ir::{Graph, InputKind};
+use model_compiler::passes::PassOptions;
+use model_compiler::pipeline;
+use model_compiler::record::Record;
+use std::path::{Path, PathBuf};
+
+/// A model image in memory, aligned as in flash.
+#[derive(Debug)]
+pub struct ImageFile {
+    path: PathBuf,
+    bytes: AlignedBytes,
+}
+
+impl ImageFile {
+    /// Reads an image file.
+    ///
+    /// # Errors
+    /// The file cannot be read or is no image.
+    pub fn read(path: &Path) -> Result<Self> {
+        let bytes = read(path)?;
+        if !is_image(&bytes) {
+            let error = Error::new(ErrorCode::Malformed, path.display().to_string(), "this is no model image");
+            return Err(error.with_help("model-compiler compile makes one: compile MODEL --calib FRAMES -o OUT.img"));
+        }
+        Ok(Self { path: path.to_path_buf(), bytes: AlignedBytes::from(bytes.as_slice()) })
+    }
+
+    /// The image behind the bytes.
+    ///
+    /// # Errors
+    /// The runtime's own check refuses it.
+    pub fn parse(&self) -> Result<Image<'_>> {
+        let refuse = |e: firmware::image::ParseError| {
+            Error::new(ErrorCode::Malformed, self.path.display().to_string(), e.to_string())
+        };
+        Image::parse(&self.bytes).map_err(refuse)
+    }
+
+    /// SHA-256 of the file.
+    pub fn sha256(&self) -> [u8; 32] {
+        artifact::sha256(&self.bytes)
+    }
+
+    /// Size of the file: bytes of flash.
+    pub fn flash_bytes(&self) -> u64 {
+        self.bytes.len() as u64
+    }
+
+    /// Reads the record that belongs to the image: the given file, or the one beside the image.
+    ///
+    /// # Errors
+    /// The record is missing or damaged, or belongs to another image.
+    pub fn record(&self, path: Option<&Path>) -> Result<Record> {
+        let path = path.map_or_else(|| pipeline::record_path(&self.path), Path::to_path_buf);
+        let record: Record = artifact::read(&path).map_err(|e| match e.code {
+            ErrorCode::Io => e.with_help("the record is written beside the image; --record FILE names another place"),
+            _ => e,
+        })?;
+        if record.image_sha256 != self.sha256() {
+            let found = artifact::hex(&self.sha256()[..8]);
+            let expected = artifact::hex(&record.image_sha256[..8]);
+            let message = format!(
+                "the record belongs to another image: digest of {} is {found}…, expected {expected}…",
+                self.path.display()
+            );
+            let error = Error::new(ErrorCode::Malformed, path.display().to_string(), message);
+            return Err(error.with_help("compile again, or keep OUT.img and OUT.record of one build together"));
+        }
+        Ok(record)
+    }
+}
+
+/// Whether a file is a model image, by its first bytes.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn is_image_file(path: &Path) -> Result<bool> {
+    use std::io::Read;
+    let mut start = Vec::new();
+    let file = std::fs::File::open(path).map_err(|e| Error::io(path, &e))?;
+    file.take(layout::MAGIC.len() as u64).read_to_end(&mut start).map_err(|e| Error::io(path, &e))?;
+    Ok(is_image(&start))
+}
+
+fn is_image(bytes: &[u8]) -> bool {
+    bytes.starts_with(&layout::MAGIC)
+}
+
+/// SHA-256 of a file, as 64 hexadecimal digits.
+///
+/// # Errors
+/// The file cannot be read.
+pub fn file_sha256(path: &Path) -> Result<String> {
+    Ok(artifact::hex(&artifact::sha256(&read(path)?)))
+}
+
+/// The optimized float graph of a checkpoint.
+///
+/// # Errors
+/// The file is no checkpoint of a known system.
+pub fn load_graph(path: &Path) -> Result<Graph> {
+    pipeline::load_graph(path, &ImportOptions::default(), &PassOptions::default())
+}
+
+/// Where frames come from.
+#[derive(Clone, Debug, PartialEq, Eq, clap::Args)]
+#[group(required = true, multiple = false)]
+pub struct FrameSource {
+    /// Frame directory: FRAMES/<name>/{rgb.png, lidar.bin, frame.json}.
+    #[arg(long, value_name = "DIR")]
+    pub frames: Option<PathBuf>,
+    /// Raw network inputs by name, first dimension = frames.
+    #[arg(long, value_name = "FILE.safetensors")]
+    pub inputs: Option<PathBuf>,
+}
+
+impl FrameSource {
+    /// Loads what the network reads.
+    ///
+    /// # Errors
+    /// See [`frames::load`]; also a file where a directory is expected and the other way round.
+    pub fn load(&self, format: &FrameFormat) -> Result<Vec<Frame>> {
+        let usage = |path: &Path, message: &str| Err(Error::new(ErrorCode::Usage, path.display().to_string(), message));
+        match (&self.frames, &self.inputs) {
+            (Some(path), _) if path.is_file() => usage(path, "--frames takes a directory; a file goes to --inputs"),
+            (None, Some(path)) if path.is_dir() => usage(path, "--inputs takes a file; a directory goes to --frames"),
+            (Some(path), _) | (None, Some(path)) => frames::load(path, format),
+            (None, None) => {
+                Err(Error::new(ErrorCode::Usage, "", "no frames given").with_help("--frames DIR or --inputs FILE"))
+            }
+        }
+    }
+}
+
+/// What an image reads, from its ports alone.
+///
+/// # Errors
+/// An input has a name that no sensor fills.
+pub fn frame_format(image: &Image<'_>) -> Result<FrameFormat> {
+    let mut inputs = Vec::new();
+    for port in (0..image.input_count()).filter_map(|i| image.input(i)) {
+        let shape = image.tensor(port.tensor).map(|record| record.shape);
+        inputs.extend(shape.map(|shape| (input_kind(port.name), shape)));
+    }
+    let inputs = inputs.into_iter().map(|(kind, shape)| Ok((kind?, shape))).collect::<Result<Vec<_>>>()?;
+    // The height that splits the histogram is not in the image; of the systems with a histogram only TransFuser
+    // reads the speed.
+    let reads_speed = inputs.iter().any(|(kind, _)| *kind == InputKind::Velocity);
+    Ok(FrameFormat::new(if reads_speed { "transfuser" } else { "late_fusion" }, inputs))
+}
+
+/// What an input of this name holds.
+///
+/// # Errors
+/// The name is unknown.
+pub fn input_kind(name: &str) -> Result<InputKind> {
+    let kinds = [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal];
+    let kind = kinds.into_iter().find(|&kind| frames::input_name(kind) == name);
+    kind.ok_or_else(|| Error::new(ErrorCode::Unsupported, format!("input `{name}`"), "no sensor gives this input"))
+}
+
+fn read(path: &Path) -> Result<Vec<u8>> {
+    std::fs::read(path).map_err(|e| Error::io(path, &e))
+}

@@ -1,0 +1,158 @@
+//! `inspect`: what is in a file.
+
+use crate::artifact::{self, hex};
+use crate::emit::AlignedBytes;
+use crate::error::{Error, ErrorCode, Result};
+use crate::import::checkpoint;
+use crate::import::{NamedTensors, System};
+use crate::qmodel::QModel;
+use comfy_table::{CellAlignment, Table, presets};
+use firmware::image::{Image, SectionKind, layout};
+use firmware::tensor::ElementType;
+use std::path::Path;
+
+/// Prints what a file holds; the kind is told from its content.
+///
+/// # Errors
+/// Unreadable or damaged file.
+pub fn inspect(path: &Path) -> Result<()> {
+    let bytes = std::fs::read(path).map_err(|e| Error::io(path, &e))?;
+    let result = if bytes.starts_with(&layout::MAGIC) {
+        image(&bytes)
+    } else if artifact::is::<QModel>(&bytes) {
+        artifact::from_bytes(&bytes).map(|model| qmodel(&model))
+    } else {
+        checkpoint::parse(&bytes).map(|checkpoint| tensors(&checkpoint))
+    };
+    result.map_err(|e| e.within(path.display()))
+}
+
+/// A plain table: headers, then rows; every column after the first `left` ones is aligned right.
+fn table(headers: &[&str], left: usize) -> Table {
+    let mut table = Table::new();
+    table.load_style(presets::NOTHING).set_header(headers);
+    for (index, column) in table.column_iter_mut().enumerate() {
+        column.set_cell_alignment(if index < left { CellAlignment::Left } else { CellAlignment::Right });
+    }
+    table
+}
+
+fn element_name(element: ElementType) -> &'static str {
+    match element {
+        ElementType::I8 => "i8",
+        ElementType::I16 => "i16",
+        ElementType::I32 => "i32",
+        ElementType::Scratch => "scratch",
+    }
+}
+
+fn image(bytes: &[u8]) -> Result<()> {
+    let aligned = AlignedBytes::from(bytes);
+    let malformed = |message: String| Error::new(ErrorCode::Malformed, "", message);
+    let image = Image::parse(&aligned).map_err(|e| malformed(e.to_string()))?;
+    println!("model image  {}", image.name());
+    println!("sha256       {}", hex(&artifact::sha256(bytes)));
+    println!("qmodel       {}", hex(&image.qmodel_digest()));
+    println!("bytes        {}", bytes.len());
+    println!("arena        {} B, aligned to {}", image.arena_bytes(), image.arena_alignment());
+    println!("steps        {}", image.step_count());
+    let check = image.check().map_or_else(|e| e.to_string(), |()| "all section CRCs match".into());
+    println!("check        {check}\n");
+
+    let mut sections = table(&["section", "bytes", "crc32"], 1);
+    for kind in SectionKind::ALL {
+        let length = image.section(kind).len().to_string();
+        sections.add_row([kind.name().to_owned(), length, format!("{:08x}", image.section_crc(kind))]);
+    }
+    println!("{sections}\n");
+
+    let mut ports = table(&["port", "name", "type", "shape", "scale", "zero point"], 4);
+    let inputs = (0..image.input_count()).filter_map(|i| Some(("input", image.input(i)?)));
+    let outputs = (0..image.output_count()).filter_map(|i| Some(("output", image.output(i)?)));
+    for (direction, port) in inputs.chain(outputs) {
+        let Some(record) = image.tensor(port.tensor) else { continue };
+        let shape = format!("{}×{}×{}", record.shape.height, record.shape.width, record.shape.channels);
+        let (scale, zero_point) = (port.scale.to_string(), port.zero_point.to_string());
+        ports.add_row([direction, port.name, element_name(record.element), &shape, &scale, &zero_point]);
+    }
+    println!("{ports}\n");
+
+    let records: Vec<_> =
+        (0..image.tensor_count()).filter_map(|i| image.tensor(firmware::tensor::TensorId(i))).collect();
+    let mut steps = table(&["op", "output", "shape", "step", "offset", "bytes", "live to", "live bytes"], 3);
+    for position in 0..image.step_count() {
+        let Some(step) = image.step(position) else { continue };
+        let Some(output) = image.tensor(step.output()) else { continue };
+        let live: u64 = live_bytes(&records, position);
+        let shape = output.shape;
+        steps.add_row([
+            step.name().to_owned(),
+            element_name(output.element).to_owned(),
+            format!("{}×{}×{}", shape.height, shape.width, shape.channels),
+            position.to_string(),
+            output.offset.to_string(),
+            output.bytes.to_string(),
+            output.last_step.to_string(),
+            live.to_string(),
+        ]);
+    }
+    println!("{steps}");
+    let bound = (0..image.step_count()).map(|p| live_bytes(&records, p)).max().unwrap_or(0);
+    println!("\narena {} B, largest live sum {bound} B", image.arena_bytes());
+    Ok(())
+}
+
+/// Arena bytes that hold something at a step: the union of the live buffers (buffers that share memory count once).
+fn live_bytes(records: &[firmware::image::TensorRecord], position: u16) -> u64 {
+    let mut ranges: Vec<(u64, u64)> =
+        records.iter().filter(|r| r.is_live(position)).map(|r| (u64::from(r.offset), r.end())).collect();
+    ranges.sort_unstable();
+    let (mut covered, mut sum) = (0, 0);
+    for (start, end) in ranges {
+        sum += end.max(covered) - start.max(covered);
+        covered = covered.max(end);
+    }
+    sum
+}
+
+fn qmodel(model: &QModel) {
+    println!("quantized model  {} ({})", model.name, model.system);
+    for (key, value) in &model.provenance {
+        println!("{key:>20}  {value}");
+    }
+    println!();
+    let mut steps = table(&["step", "op", "type", "shape", "scale", "zero point", "headroom bits", "weight bytes"], 3);
+    for step in &model.steps {
+        let output = model.tensor(step.op.output());
+        steps.add_row([
+            step.name.clone(),
+            step.op.name().to_owned(),
+            element_name(output.element).to_owned(),
+            format!("{}×{}×{}", output.shape.height, output.shape.width, output.shape.channels),
+            format!("{:.6}", output.scale),
+            output.zero_point.to_string(),
+            step.bounds.headroom_bits.to_string(),
+            step.op.weight_bytes().to_string(),
+        ]);
+    }
+    println!("{steps}");
+}
+
+fn tensors(checkpoint: &checkpoint::Checkpoint) {
+    let named = NamedTensors::from(checkpoint.clone());
+    let system = System::detect(&named).map_or("not recognized", System::name);
+    let values: usize = checkpoint.tensors().iter().map(|t| t.shape.iter().product::<usize>()).sum();
+    println!("checkpoint  {}", checkpoint.format().name());
+    println!("system      {system}");
+    println!("sha256      {}", hex(checkpoint.sha256()));
+    println!("tensors     {}, {values} values\n", checkpoint.tensors().len());
+    let mut rows = table(&["tensor", "type", "shape", "values"], 2);
+    for tensor in checkpoint.tensors() {
+        let count = tensor.shape.iter().product::<usize>().to_string();
+        rows.add_row([tensor.name.clone(), format!("{:?}", tensor.dtype), format!("{:?}", tensor.shape), count]);
+    }
+    println!("{rows}");
+    if !checkpoint.skipped().is_empty() {
+        println!("\nnot tensors, skipped: {}", checkpoint.skipped().join(", "));
+    }
+}

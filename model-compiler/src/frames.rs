@@ -1,0 +1,259 @@
+//! Camera, LiDAR, speed and goal of one moment, as a network reads them: for calibration and for evaluation.
+//!
+//! Two sources give the same [`Frame`]:
+//! * a **frame directory** `FRAMES/<name>/{rgb.png, lidar.bin, frame.json}`: sensor data, prepared here ([`camera`],
+//!   [`bev`]) by the rules that the networks were trained with
+//! * a **tensor file** (`.safetensors`) of ready network inputs, first dimension = frames
+//!
+//! What has to be present follows from the network ([`FrameFormat`]); the rest may be missing.
+
+use crate::error::{Error, ErrorCode, Result};
+use crate::ir::{Graph, InputKind};
+use crate::qmodel::QModel;
+use firmware::tensor::Shape;
+use sha2::{Digest, Sha256};
+use std::path::Path;
+
+pub mod bev;
+pub mod camera;
+mod directory;
+mod tensors;
+
+/// Which inputs a network reads, and how its LiDAR histogram is cut.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FrameFormat {
+    /// RGB image `H×W×3`.
+    pub image: Option<Shape>,
+    /// LiDAR histogram `lateral×longitudinal×2`.
+    pub bev: Option<Shape>,
+    /// Forward speed.
+    pub velocity: bool,
+    /// Goal point.
+    pub goal: bool,
+    /// Height that separates the two histogram channels: meters, relative to a sensor 2.5 m above ground.
+    pub split_height_m: f64,
+}
+
+impl FrameFormat {
+    /// The format of a network of this system with these inputs.
+    pub fn new(system: &str, inputs: impl IntoIterator<Item = (InputKind, Shape)>) -> Self {
+        let mut format =
+            Self { image: None, bev: None, velocity: false, goal: false, split_height_m: split_height_m(system) };
+        for (kind, shape) in inputs {
+            match kind {
+                InputKind::Image => format.image = Some(shape),
+                InputKind::Bev => format.bev = Some(shape),
+                InputKind::Velocity => format.velocity = true,
+                InputKind::Goal => format.goal = true,
+            }
+        }
+        format
+    }
+
+    /// The format that a float graph reads.
+    pub fn of_graph(graph: &Graph) -> Self {
+        Self::new(&graph.system, graph.inputs().map(|(id, kind)| (kind, graph.value(id).shape)))
+    }
+
+    /// The format that a quantized model reads.
+    pub fn of_model(model: &QModel) -> Self {
+        let inputs = model.inputs.iter().filter_map(|port| Some((port.kind?, model.tensor(port.tensor).shape)));
+        Self::new(&model.system, inputs)
+    }
+}
+
+/// TransFuser cuts half a meter above ground; the baselines were trained with the cut far above everything.
+fn split_height_m(system: &str) -> f64 {
+    match system {
+        "late_fusion" | "geometric_fusion" => 2.0,
+        _ => -2.0,
+    }
+}
+
+/// A byte map, channel fastest.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ByteMap {
+    /// Height, width, channels.
+    pub shape: Shape,
+    /// `height·width·channels` values.
+    pub data: Vec<u8>,
+}
+
+/// One moment of driving.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Folder name, or `FILE#INDEX`.
+    pub name: String,
+    /// RGB image `H×W×3`, 0..=255, cropped to the network's size.
+    pub rgb: Option<ByteMap>,
+    /// LiDAR counts 0..=5, `lateral×longitudinal×2`; rows from right to left, columns from far to near.
+    pub bev: Option<ByteMap>,
+    /// Forward speed, m/s.
+    pub velocity: Option<f64>,
+    /// Goal `[right, forward-negative]`, m.
+    pub goal: Option<[f64; 2]>,
+    /// Navigation command 1..=6; no network input here.
+    pub command: Option<u8>,
+    /// LiDAR points with a coordinate that is not finite; they are left out.
+    pub dropped_points: usize,
+}
+
+impl Frame {
+    /// The values of one network input in raw units: grey levels, counts, m/s, m.
+    ///
+    /// # Errors
+    /// The frame does not hold this input.
+    pub fn raw(&self, kind: InputKind) -> Result<Vec<f32>> {
+        let bytes = |map: &ByteMap| map.data.iter().map(|&v| f32::from(v)).collect();
+        let values = match kind {
+            InputKind::Image => self.rgb.as_ref().map(bytes),
+            InputKind::Bev => self.bev.as_ref().map(bytes),
+            InputKind::Velocity => self.velocity.map(|v| vec![v as f32]),
+            InputKind::Goal => self.goal.map(|g| g.map(|v| v as f32).to_vec()),
+        };
+        values.ok_or_else(|| {
+            Error::new(
+                ErrorCode::Frames,
+                format!("frame {}", self.name),
+                format!("holds no {} input", input_name(kind)),
+            )
+        })
+    }
+
+    /// The same moment seen in a mirror: left and right change places. A second, independent sample for evaluation.
+    #[must_use]
+    pub fn mirrored(&self) -> Self {
+        Self {
+            name: format!("{} (mirrored)", self.name),
+            rgb: self.rgb.as_ref().map(flip_columns),
+            bev: self.bev.as_ref().map(flip_rows),
+            goal: self.goal.map(|[right, y]| [0.0 - right, y]),
+            command: self.command.map(mirrored_command),
+            ..self.clone()
+        }
+    }
+
+    /// SHA-256 over everything that a network reads of this frame. The name does not count.
+    pub fn digest(&self) -> [u8; 32] {
+        let mut hash = Sha256::new();
+        for kind in [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal] {
+            if let Ok(values) = self.raw(kind) {
+                hash.update(input_name(kind));
+                values.iter().for_each(|v| hash.update(v.to_le_bytes()));
+            }
+        }
+        hash.finalize().into()
+    }
+
+    /// The first 16 hexadecimal digits of [`Self::digest`]: how provenance names a frame.
+    pub fn short_digest(&self) -> String {
+        self.digest()[..8].iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+}
+
+/// Name of a network input, as ports carry it.
+pub fn input_name(kind: InputKind) -> &'static str {
+    match kind {
+        InputKind::Image => "rgb",
+        InputKind::Bev => "bev",
+        InputKind::Velocity => "velocity",
+        InputKind::Goal => "goal",
+    }
+}
+
+/// Loads frames: a directory is a frame directory, a file is a tensor file.
+///
+/// # Errors
+/// Anything missing, damaged or misshapen, with its file and field; no frame at all.
+pub fn load(path: &Path, format: &FrameFormat) -> Result<Vec<Frame>> {
+    let metadata = std::fs::metadata(path).map_err(|e| {
+        Error::io(path, &e)
+            .with_help("frames are a directory FRAMES/<name>/{rgb.png, lidar.bin, frame.json} or a .safetensors file")
+    })?;
+    if metadata.is_dir() { directory::load(path, format) } else { tensors::load(path, format) }
+}
+
+/// Names of the evaluation frames that are also among the calibration frames, given by their short digests.
+pub fn overlap<'a>(calibration_digests: &[&str], evaluation: &'a [Frame]) -> Vec<&'a str> {
+    let is_known = |frame: &&Frame| calibration_digests.contains(&frame.short_digest().as_str());
+    evaluation.iter().filter(is_known).map(|frame| frame.name.as_str()).collect()
+}
+
+fn flip_columns(map: &ByteMap) -> ByteMap {
+    let (row, pixel) =
+        (usize::from(map.shape.width) * usize::from(map.shape.channels), usize::from(map.shape.channels));
+    let data = map.data.chunks(row).flat_map(|r| r.chunks(pixel).rev().flatten().copied()).collect();
+    ByteMap { shape: map.shape, data }
+}
+
+fn flip_rows(map: &ByteMap) -> ByteMap {
+    let row = usize::from(map.shape.width) * usize::from(map.shape.channels);
+    ByteMap { shape: map.shape, data: map.data.chunks(row).rev().flatten().copied().collect() }
+}
+
+/// 1 left, 2 right, 5 change left, 6 change right; 3 straight and 4 follow stay.
+fn mirrored_command(command: u8) -> u8 {
+    match command {
+        1 => 2,
+        2 => 1,
+        5 => 6,
+        6 => 5,
+        other => other,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame() -> Frame {
+        Frame {
+            name: "a".into(),
+            rgb: Some(ByteMap { shape: Shape::map(1, 2, 3), data: vec![1, 2, 3, 4, 5, 6] }),
+            bev: Some(ByteMap { shape: Shape::map(2, 2, 1), data: vec![0, 1, 2, 3] }),
+            velocity: Some(3.5),
+            goal: Some([1.0, -20.0]),
+            command: Some(1),
+            dropped_points: 0,
+        }
+    }
+
+    #[test]
+    fn mirroring_swaps_left_and_right_and_twice_is_identity() {
+        let mirrored = frame().mirrored();
+        assert_eq!(mirrored.rgb.as_ref().unwrap().data, [4, 5, 6, 1, 2, 3]);
+        assert_eq!(mirrored.bev.as_ref().unwrap().data, [2, 3, 0, 1]);
+        assert_eq!(mirrored.goal, Some([-1.0, -20.0]));
+        assert_eq!(mirrored.velocity, Some(3.5));
+        assert_eq!(mirrored.command, Some(2));
+        let twice = Frame { name: "a".into(), ..mirrored.mirrored() };
+        assert_eq!(twice, frame());
+    }
+
+    #[test]
+    fn overlap_finds_equal_content_under_another_name() {
+        let renamed = Frame { name: "b".into(), ..frame() };
+        let faster = Frame { name: "c".into(), velocity: Some(4.0), ..frame() };
+        let digest = frame().short_digest();
+        assert_eq!(digest.len(), 16);
+        let evaluation = [renamed, faster, frame().mirrored()];
+        assert_eq!(overlap(&["0123456789abcdef", &digest], &evaluation), ["b"]);
+        assert!(overlap(&[], &evaluation).is_empty());
+    }
+
+    #[test]
+    fn a_missing_input_is_named() {
+        let error = Frame { bev: None, ..frame() }.raw(InputKind::Bev).unwrap_err();
+        assert_eq!(error.to_string(), "frame a: holds no bev input");
+    }
+
+    #[test]
+    fn the_format_follows_from_the_system_and_its_inputs() {
+        let bev = Shape::map(256, 256, 2);
+        let late = FrameFormat::new("late_fusion", [(InputKind::Bev, bev), (InputKind::Goal, Shape::vector(2))]);
+        assert_eq!(late.bev, Some(bev));
+        assert!(late.goal && !late.velocity && late.image.is_none());
+        assert_eq!(late.split_height_m, 2.0);
+        assert_eq!(FrameFormat::new("transfuser", []).split_height_m, -2.0);
+    }
+}

@@ -1,0 +1,211 @@
+//! Ready network inputs in a `.safetensors` file: `rgb` u8 `[N,3,H,W]`, `bev` u8 `[N,2,H,W]` (counts 0..=5), `velocity`
+//! f32 `[N]`, `target` f32 `[N,2]` (network frame), and optionally `command` i32 `[N]`.
+
+use super::{ByteMap, Frame, FrameFormat, bev};
+use crate::error::{Error, ErrorCode, Result};
+use firmware::tensor::Shape;
+use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use std::path::Path;
+
+/// Loads the tensors that the network needs; others may be missing or of any shape.
+pub(super) fn load(path: &Path, format: &FrameFormat) -> Result<Vec<Frame>> {
+    let bytes = std::fs::read(path).map_err(|e| Error::io(path, &e))?;
+    let file = SafeTensors::deserialize(&bytes).map_err(|e| {
+        Error::new(ErrorCode::Malformed, path.display().to_string(), format!("not a safetensors file: {e}"))
+    })?;
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    frames(&file, &stem, format).map_err(|e| e.within(path.display()))
+}
+
+fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Vec<Frame>> {
+    let mut batch = Batch { file, frames: None };
+    let rgb = format.image.map(|shape| batch.maps("rgb", shape)).transpose()?;
+    let bev = format.bev.map(|shape| batch.maps("bev", shape)).transpose()?;
+    if let Some(count) = bev.iter().flatten().flat_map(|map| &map.data).find(|&&count| count > bev::MAX_COUNT) {
+        return Err(tensor_error("bev", format!("holds {count}, expected counts 0..=5")));
+    }
+    let velocity = format.velocity.then(|| batch.floats("velocity", &[])).transpose()?;
+    let goal = format.goal.then(|| batch.floats("target", &[2])).transpose()?;
+    let count = batch.frames.unwrap_or(0);
+    let command = batch.commands(count)?;
+    if count == 0 {
+        return Err(Error::new(ErrorCode::Frames, "", "holds no frame that this network could read"));
+    }
+    let frame = |i: usize| Frame {
+        name: format!("{stem}#{i}"),
+        rgb: rgb.as_ref().map(|maps| maps[i].clone()),
+        bev: bev.as_ref().map(|maps| maps[i].clone()),
+        velocity: velocity.as_ref().map(|v| f64::from(v[i])),
+        goal: goal.as_ref().map(|g| [f64::from(g[2 * i]), f64::from(g[2 * i + 1])]),
+        command: command.as_ref().map(|c| c[i]),
+        dropped_points: 0,
+    };
+    Ok((0..count).map(frame).collect())
+}
+
+/// A file and the number of frames that its tensors agree on so far.
+struct Batch<'a> {
+    file: &'a SafeTensors<'a>,
+    frames: Option<usize>,
+}
+
+impl Batch<'_> {
+    fn tensor(&mut self, name: &str, element: Dtype, per_frame: &[usize]) -> Result<TensorView<'_>> {
+        let Ok(view) = self.file.tensor(name) else {
+            let held = self.file.names().join(", ");
+            return Err(
+                tensor_error(name, "missing; this network needs it").with_help(format!("the file holds: {held}"))
+            );
+        };
+        let fits = view.shape().split_first().filter(|(_, rest)| *rest == per_frame && view.dtype() == element);
+        let frames = fits.map(|(&frames, _)| frames).filter(|&n| self.frames.is_none_or(|known| known == n));
+        match frames {
+            Some(n) => self.frames = Some(n),
+            None => return Err(self.mismatch(name, &view, element, per_frame)),
+        }
+        Ok(view)
+    }
+
+    fn mismatch(&self, name: &str, view: &TensorView<'_>, element: Dtype, per_frame: &[usize]) -> Error {
+        let frames = self.frames.map_or("N".to_owned(), |n| n.to_string());
+        let expected: Vec<String> = std::iter::once(frames).chain(per_frame.iter().map(usize::to_string)).collect();
+        let message = format!("{:?} {:?}, expected {element:?} [{}]", view.dtype(), view.shape(), expected.join(", "));
+        tensor_error(name, message)
+    }
+
+    /// `[N][C][H][W]` to a channel-fastest map per frame.
+    fn maps(&mut self, name: &str, shape: Shape) -> Result<Vec<ByteMap>> {
+        let [height, width, channels] = [shape.height, shape.width, shape.channels].map(usize::from);
+        let view = self.tensor(name, Dtype::U8, &[channels, height, width])?;
+        let plane = height * width;
+        let channel_fastest = |planes: &[u8]| {
+            let data = (0..plane).flat_map(|p| (0..channels).map(move |c| planes[c * plane + p])).collect();
+            ByteMap { shape, data }
+        };
+        Ok(view.data().chunks_exact(channels * plane).map(channel_fastest).collect())
+    }
+
+    fn floats(&mut self, name: &str, per_frame: &[usize]) -> Result<Vec<f32>> {
+        let view = self.tensor(name, Dtype::F32, per_frame)?;
+        let values: Vec<f32> =
+            view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+        match values.iter().find(|v| !v.is_finite()) {
+            Some(value) => Err(tensor_error(name, format!("holds {value}, expected finite values"))),
+            None => Ok(values),
+        }
+    }
+
+    /// Commands are no input of these networks: used where they fit, ignored where not.
+    fn commands(&mut self, frames: usize) -> Result<Option<Vec<u8>>> {
+        let Ok(view) = self.file.tensor("command") else { return Ok(None) };
+        if view.dtype() != Dtype::I32 || view.shape() != [frames] {
+            return Ok(None);
+        }
+        let values = view.data().chunks_exact(4).map(|b| i32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+        Ok(values.map(|v| u8::try_from(v).ok().filter(|c| (1..=6).contains(c))).collect())
+    }
+}
+
+fn tensor_error(name: &str, message: impl Into<String>) -> Error {
+    Error::new(ErrorCode::Frames, format!("tensor `{name}`"), message)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ir::InputKind;
+
+    fn format() -> FrameFormat {
+        let inputs = [
+            (InputKind::Image, Shape::map(2, 1, 3)),
+            (InputKind::Bev, Shape::map(1, 2, 2)),
+            (InputKind::Velocity, Shape::vector(1)),
+            (InputKind::Goal, Shape::vector(2)),
+        ];
+        FrameFormat::new("transfuser", inputs)
+    }
+
+    struct Tensor(&'static str, Dtype, Vec<usize>, Vec<u8>);
+
+    fn good() -> Vec<Tensor> {
+        let floats = |values: &[f32]| values.iter().flat_map(|v| v.to_le_bytes()).collect();
+        vec![
+            Tensor("rgb", Dtype::U8, vec![2, 3, 2, 1], (0..12).collect()),
+            Tensor("bev", Dtype::U8, vec![2, 2, 1, 2], vec![0, 1, 2, 3, 4, 5, 0, 0]),
+            Tensor("velocity", Dtype::F32, vec![2], floats(&[1.5, 2.5])),
+            Tensor("target", Dtype::F32, vec![2, 2], floats(&[1.0, -2.0, 3.0, -4.0])),
+            Tensor("command", Dtype::I32, vec![2], [1_i32, 4].iter().flat_map(|v| v.to_le_bytes()).collect()),
+        ]
+    }
+
+    fn load_tensors(tensors: &[Tensor]) -> Result<Vec<Frame>> {
+        let views = tensors.iter().map(|t| (t.0, TensorView::new(t.1, t.2.clone(), &t.3).unwrap()));
+        let bytes = safetensors::serialize(views, None).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("inputs.safetensors");
+        std::fs::write(&path, bytes).unwrap();
+        load(&path, &format())
+    }
+
+    #[test]
+    fn planes_become_channel_fastest_maps() {
+        let frames = load_tensors(&good()).unwrap();
+        assert_eq!(frames.len(), 2);
+        assert_eq!(frames[1].name, "inputs#1");
+        assert_eq!(frames[1].rgb.as_ref().unwrap().data, [6, 8, 10, 7, 9, 11]);
+        assert_eq!(frames[0].bev.as_ref().unwrap().data, [0, 2, 1, 3]);
+        assert_eq!((frames[1].velocity, frames[1].goal, frames[1].command), (Some(2.5), Some([3.0, -4.0]), Some(4)));
+    }
+
+    #[test]
+    fn wrong_tensors_are_named_with_found_and_expected() {
+        type Damage = fn(&mut Vec<Tensor>);
+        let cases: [(Damage, &str); 6] = [
+            (|t| drop(t.remove(0)), "tensor `rgb`: missing; this network needs it\n  help: the file holds: "),
+            (|t| t[1].2 = vec![2, 2, 2, 1], "tensor `bev`: U8 [2, 2, 2, 1], expected U8 [2, 2, 1, 2]"),
+            (|t| t[2].1 = Dtype::I32, "tensor `velocity`: I32 [2], expected F32 [2]"),
+            (|t| t[3].2 = vec![1, 4], "tensor `target`: F32 [1, 4], expected F32 [2, 2]"),
+            (|t| t[1].3[0] = 6, "tensor `bev`: holds 6, expected counts 0..=5"),
+            (|t| t[2].3 = f32::NAN.to_le_bytes().repeat(2), "tensor `velocity`: holds NaN, expected finite values"),
+        ];
+        for (damage, expected) in cases {
+            let mut tensors = good();
+            damage(&mut tensors);
+            let message = load_tensors(&tensors).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_file_that_is_no_safetensors_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("x.safetensors");
+        std::fs::write(&path, b"not at all").unwrap();
+        assert!(load(&path, &format()).unwrap_err().to_string().contains("not a safetensors file"));
+    }
+
+    /// The histogram rule against the networks' own preprocessing, cell by cell.
+    ///
+    /// The file labels its counts `[2, 256, 256]`, but their bytes lie channel-fastest, as the histogram is made (the
+    /// other reading puts points of a street scene into every second column only).
+    #[test]
+    fn golden_points_give_the_golden_histogram() {
+        let workspace_neighbor = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared");
+        let shared = std::env::var_os("SHARED_DIR").map_or_else(workspace_neighbor, std::path::PathBuf::from);
+        let Ok(bytes) = std::fs::read(shared.join("golden/bev.safetensors")) else {
+            println!("not run: shared/golden/bev.safetensors is absent");
+            return;
+        };
+        let file = SafeTensors::deserialize(&bytes).unwrap();
+        let (points, counts) = (file.tensor("points").unwrap(), file.tensor("bev_counts").unwrap());
+        let coordinate = |b: &[u8], i: usize| f64::from(f32::from_le_bytes([0, 1, 2, 3].map(|k| b[4 * i + k])));
+        let points = points.data().chunks_exact(12).map(|b| [0, 1, 2].map(|i| coordinate(b, i)));
+        let (map, dropped) = bev::histogram(points, -2.0);
+        assert_eq!(dropped, 0);
+        assert_eq!(counts.data().iter().map(|&c| u32::from(c)).sum::<u32>(), 9422);
+        for (i, (&found, &expected)) in map.data.iter().zip(counts.data()).enumerate() {
+            assert_eq!(found, expected, "row {}, column {}, channel {}", i / 512, i / 2 % 256, i % 2);
+        }
+        assert_eq!(map.data.len(), counts.data().len());
+    }
+}

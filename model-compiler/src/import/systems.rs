@@ -1,0 +1,54 @@
+//! One file per system, over shared parts: the tensor list with its problems, the graph builder, ResNet, transformer,
+//! head.
+//!
+//! A further system is one more file with `recognize` and `build`, and its line in the two tables here.
+
+use super::{ImportOptions, NamedTensors, System};
+use crate::error::{Error, ErrorCode, Result};
+use crate::ir::Graph;
+use builder::Builder;
+
+mod aim;
+mod builder;
+mod detect;
+mod head;
+mod late_fusion;
+mod resnet;
+mod transformer;
+mod transfuser;
+mod weights;
+
+/// Whether some tensor is named like this.
+fn has(tensors: &NamedTensors, prefix: &str) -> bool {
+    tensors.under(prefix).next().is_some()
+}
+
+/// The system of these names. The order matters: some systems' names include those of a simpler one.
+pub(super) fn detect(tensors: &NamedTensors) -> Option<System> {
+    let recognized: [(System, bool); 6] = [
+        (System::Lbc, has(tensors, "net.network.backbone.")),
+        (System::Cilrs, has(tensors, "encoder.features.") && has(tensors, "controller.")),
+        (System::GeometricFusion, has(tensors, "encoder.image_conv") || has(tensors, "encoder.image_projection")),
+        (System::TransFuser, transfuser::recognize(tensors)),
+        (System::LateFusion, late_fusion::recognize(tensors)),
+        (System::Aim, aim::recognize(tensors)),
+    ];
+    recognized.into_iter().find(|(_, found)| *found).map(|(system, _)| system)
+}
+
+/// Builds the graph of this system, or lists what is wrong with the tensors.
+pub(super) fn build(system: System, name: &str, tensors: NamedTensors, options: &ImportOptions) -> Result<Graph> {
+    let recipe: fn(&mut Builder<'_>) -> Result<()> = match system {
+        System::Aim => aim::build,
+        System::LateFusion => late_fusion::build,
+        System::TransFuser => transfuser::build,
+        System::GeometricFusion | System::Cilrs | System::Lbc => {
+            let message = format!("this is a checkpoint of {}, which is not supported", system.name());
+            return Err(Error::new(ErrorCode::Unsupported, "", message)
+                .with_help("supported are aim, late_fusion and transfuser"));
+        }
+    };
+    let mut builder = Builder::new(name, system, tensors, options);
+    let built = recipe(&mut builder);
+    builder.finish(built)
+}

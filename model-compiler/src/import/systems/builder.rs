@@ -1,0 +1,136 @@
+//! The graph under construction, next to the tensors that it has not used yet.
+
+use super::weights::{Problems, oihw_to_ohwi};
+use crate::error::{Error, ErrorCode, Result};
+use crate::import::{ImportOptions, NamedTensors, System};
+use crate::ir::{BatchNorm, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Shape, ValueId, Weights};
+use firmware::program::Window;
+use std::sync::Arc;
+
+/// ε of the framework's batch norm and LayerNorm.
+const EPSILON: f32 = 1e-5;
+
+/// ImageNet statistics for values 0..1, which the networks apply to values 0..255 without dividing (spec 0.1).
+const IMAGE_MEAN: [f32; 3] = [0.485, 0.456, 0.406];
+const IMAGE_STD: [f32; 3] = [0.229, 0.224, 0.225];
+
+pub(super) struct Builder<'a> {
+    pub(super) graph: Graph,
+    pub(super) tensors: NamedTensors,
+    pub(super) options: &'a ImportOptions,
+    problems: Problems,
+}
+
+impl<'a> Builder<'a> {
+    pub(super) fn new(name: &str, system: System, tensors: NamedTensors, options: &'a ImportOptions) -> Self {
+        let graph = Graph { name: name.into(), system: system.name().into(), ..Graph::default() };
+        Self { graph, tensors, options, problems: Problems::default() }
+    }
+
+    /// The graph, or everything that is wrong with the tensors, or (only where those are in order) why the recipe
+    /// stopped. What is surplus is known only where it ran to its end.
+    pub(super) fn finish(mut self, built: Result<()>) -> Result<Graph> {
+        if built.is_ok() {
+            self.problems.add_surplus(&self.tensors);
+        }
+        self.problems.into_result(&self.graph.system)?;
+        built.map(|()| self.graph)
+    }
+
+    /// Adds a node; operands that do not fit make the network unsupported.
+    pub(super) fn push(&mut self, name: impl Into<String>, op: Op, inputs: &[ValueId]) -> Result<ValueId> {
+        let (name, kind) = (name.into(), op.name());
+        self.graph
+            .push(&name, op, inputs)
+            .map_err(|message| Error::new(ErrorCode::Unsupported, format!("{kind} {name}"), message))
+    }
+
+    /// Values of a tensor; zeros where it does not fit (the graph is then refused at the end).
+    pub(super) fn vector(&mut self, name: &str, shape: &[usize]) -> Arc<Vec<f32>> {
+        let mut values = self.problems.take(&mut self.tensors, name, shape);
+        values.resize(shape.iter().product(), 0.0);
+        Arc::new(values)
+    }
+
+    /// A matrix or higher tensor, kept in the checkpoint's order; without data where it does not fit.
+    pub(super) fn weights(&mut self, name: &str, shape: &[usize]) -> Arc<Weights> {
+        Arc::new(Weights { shape: shape.to_vec(), data: self.problems.take(&mut self.tensors, name, shape) })
+    }
+
+    /// Camera image, normalized.
+    pub(super) fn rgb(&mut self, module: &str, (height, width): (u16, u16)) -> Result<ValueId> {
+        let input = self.graph.push_input("rgb", InputKind::Image, Shape::map(height, width, 3));
+        let normalization = Normalization { mean: IMAGE_MEAN.to_vec(), std: IMAGE_STD.to_vec() };
+        self.push(format!("{module}.normalize"), Op::Normalize(Arc::new(normalization)), &[input])
+    }
+
+    /// LiDAR histogram; the division of its counts belongs to the input's kind.
+    pub(super) fn bev(&mut self, (height, width): (u16, u16), channels: usize) -> ValueId {
+        self.graph.push_input("bev", InputKind::Bev, Shape::map(height, width, channels as u16))
+    }
+
+    /// Convolution without bias (`shape` is `[O, I, kh, kw]`), then batch norm.
+    pub(super) fn conv_bn(
+        &mut self,
+        conv: &str,
+        norm: &str,
+        input: ValueId,
+        shape: [usize; 4],
+        window: Window,
+    ) -> Result<ValueId> {
+        let values = self.problems.take(&mut self.tensors, &format!("{conv}.weight"), &shape);
+        let op = Conv2d {
+            weights: oihw_to_ohwi(&values, shape),
+            bias: None,
+            window,
+            groups: 1,
+            normalization: None,
+            relu: false,
+        };
+        let map = self.push(conv, Op::Conv2d(op), &[input])?;
+        let mut vector = |leaf: &str| self.vector(&format!("{norm}.{leaf}"), &shape[..1]);
+        let op = BatchNorm {
+            weight: vector("weight"),
+            bias: vector("bias"),
+            mean: vector("running_mean"),
+            variance: vector("running_var"),
+            epsilon: EPSILON,
+        };
+        self.push(norm, Op::BatchNorm(op), &[map])
+    }
+
+    /// Linear layer with bias.
+    pub(super) fn linear(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
+        let inputs = usize::from(self.graph.value(input).shape.channels);
+        let weights = self.weights(&format!("{module}.weight"), &[outputs, inputs]);
+        let bias = Some(self.vector(&format!("{module}.bias"), &[outputs]));
+        self.push(module, Op::Linear(Linear { weights, bias, relu: false }), &[input])
+    }
+
+    /// Weight and bias of a LayerNorm, for rows `first_row ..` as a map of `grid`.
+    pub(super) fn layer_norm(&mut self, module: &str, channels: usize, grid: (u16, u16)) -> LayerNorm {
+        LayerNorm {
+            weight: self.vector(&format!("{module}.weight"), &[channels]),
+            bias: self.vector(&format!("{module}.bias"), &[channels]),
+            epsilon: EPSILON,
+            first_row: 0,
+            grid,
+        }
+    }
+}
+
+/// A square window with equal padding on all sides.
+pub(super) fn square(kernel: u8, stride: u8, padding: u8) -> Window {
+    Window {
+        kernel_h: kernel,
+        kernel_w: kernel,
+        stride_h: stride,
+        stride_w: stride,
+        pad_top: padding,
+        pad_bottom: padding,
+        pad_left: padding,
+        pad_right: padding,
+        dilation_h: 1,
+        dilation_w: 1,
+    }
+}

@@ -1,0 +1,74 @@
+//! TransFuser: camera and LiDAR networks, fused by a transformer after each of their stages.
+
+use super::builder::Builder;
+use super::{has, head, resnet::ResNet, transformer::Transformer};
+use crate::error::{Error, ErrorCode, Result};
+use crate::import::NamedTensors;
+use crate::ir::{InputKind, Op, Shape};
+
+const IMAGE: &str = "encoder.image_encoder.features";
+const LIDAR: &str = "encoder.lidar_encoder._model";
+
+/// Camera crop and LiDAR histogram as published, pixels.
+pub(super) const DEFAULT_RESOLUTION: (u16, u16) = (256, 256);
+
+/// Pixels per token of the last stage: the networks halve the resolution five times.
+const TOTAL_STRIDE: u16 = 32;
+
+pub(super) fn recognize(tensors: &NamedTensors) -> bool {
+    has(tensors, "encoder.image_encoder.") || has(tensors, "encoder.transformer")
+}
+
+/// The ablations with fewer scales lack the first transformers: a scale without one is not fused.
+pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
+    let resolution = resolution(b);
+    let grid = grid(resolution)?;
+    let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
+    let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
+    let channels = lidar_network.lidar_channels(&b.tensors);
+    let scales = Transformer::detect_all(&b.tensors, &image_network.widths, grid);
+
+    let rgb = b.rgb("encoder.image_encoder", resolution)?;
+    let bev = b.bev(resolution, channels);
+    let velocity = scales
+        .iter()
+        .any(Option::is_some)
+        .then(|| b.graph.push_input("velocity", InputKind::Velocity, Shape::vector(1)));
+    let mut image = image_network.stem(b, rgb, 3)?;
+    let mut lidar = lidar_network.stem(b, bev, channels)?;
+    for (stage, scale) in (1..=4).zip(&scales) {
+        image = image_network.stage(b, stage, image)?;
+        lidar = lidar_network.stage(b, stage, lidar)?;
+        if let (Some(transformer), Some(velocity)) = (scale, velocity) {
+            (image, lidar) = transformer.fuse(b, image, lidar, velocity)?;
+        }
+    }
+    let features = b.push("encoder", Op::GlobalPool, &[image, lidar])?;
+    head::waypoints(b, features, 2)
+}
+
+/// Tokens of one map: both maps are enlarged from the token grid by 8, 4, 2, 1, so it is as large as the last stage's
+/// map.
+fn grid((height, width): (u16, u16)) -> Result<(u16, u16)> {
+    let (rows, columns) = (height / TOTAL_STRIDE, width / TOTAL_STRIDE);
+    if rows == 0 || columns == 0 || height % TOTAL_STRIDE != 0 || width % TOTAL_STRIDE != 0 {
+        let message = format!("an input of {height}×{width} pixels does not divide into tokens");
+        return Err(Error::new(ErrorCode::Usage, "", message)
+            .with_help(format!("height and width must be multiples of {TOTAL_STRIDE} pixels")));
+    }
+    Ok((rows, columns))
+}
+
+/// The input size that was asked for, or that a square positional embedding tells, or the published one.
+fn resolution(b: &Builder<'_>) -> (u16, u16) {
+    b.options.resolution.unwrap_or_else(|| {
+        let tokens = Transformer::tokens(&b.tensors).unwrap_or(0);
+        let side = (tokens / 2).isqrt();
+        if (1..=64).contains(&side) && 2 * side * side == tokens {
+            let pixels = side as u16 * TOTAL_STRIDE;
+            (pixels, pixels)
+        } else {
+            DEFAULT_RESOLUTION
+        }
+    })
+}

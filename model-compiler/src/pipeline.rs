@@ -1,0 +1,162 @@
+//! The way from a checkpoint to an image, a line per stage.
+
+use crate::artifact::{self, hex};
+use crate::calibrate::calibrate;
+use crate::emit::emit;
+use crate::error::{Error, ErrorCode, Result};
+use crate::frames::{self, Frame, FrameFormat};
+use crate::import::{self, ImportOptions, checkpoint};
+use crate::ir::Graph;
+use crate::memory_plan::{self, PlanOptions};
+use crate::pack::pack;
+use crate::passes::{self, PassOptions};
+use crate::qmodel::QModel;
+use crate::quantize::{QuantizeOptions, quantize};
+use crate::record::Record;
+use crate::target::Target;
+use std::path::Path;
+
+/// Where the stages report how far they are: stage name, units done, units in all.
+pub type Progress<'a> = &'a mut dyn FnMut(&str, usize, usize);
+
+/// A checkpoint as an optimized float graph.
+///
+/// # Errors
+/// Unreadable file, unknown system, wrong tensors; the file is named.
+pub fn load_graph(path: &Path, import: &ImportOptions, passes: &PassOptions) -> Result<Graph> {
+    let name = path.display().to_string();
+    let tensors = checkpoint::read(path)?.into();
+    let mut graph = import::import(&name, tensors, import)?;
+    graph.name = path.file_stem().map_or(name.clone(), |stem| stem.to_string_lossy().into_owned());
+    passes::optimize_with(&mut graph, *passes).map_err(|e| e.within(name))?;
+    Ok(graph)
+}
+
+/// The raw inputs of frames in the graph's order.
+///
+/// # Errors
+/// A frame without one of the graph's inputs.
+pub fn raw_inputs(graph: &Graph, frames: &[Frame]) -> Result<Vec<Vec<Vec<f32>>>> {
+    frames.iter().map(|frame| graph.inputs().map(|(_, kind)| frame.raw(kind)).collect()).collect()
+}
+
+/// Calibrates a graph on frames and quantizes it.
+///
+/// # Errors
+/// See [`calibrate`] and [`quantize`].
+pub fn quantize_graph(
+    graph: &Graph,
+    calibration: &[Frame],
+    options: &QuantizeOptions,
+    progress: Progress<'_>,
+) -> Result<QModel> {
+    let inputs = raw_inputs(graph, calibration)?;
+    let statistics = calibrate(graph, &inputs, |done, total| progress("calibrate", done, total))?;
+    progress("quantize", 0, 1);
+    let mut model = quantize(graph, &statistics, options)?;
+    progress("quantize", 1, 1);
+    let digests: Vec<String> = calibration.iter().map(Frame::short_digest).collect();
+    model.provenance = vec![
+        ("calibration_frames".into(), digests.join(",")),
+        ("skip_stages".into(), format!("{:?}", options.skip)),
+        ("ranges".into(), format!("{:?}", options.ranges)),
+        ("bias_correction".into(), options.bias_correction.to_string()),
+        ("wide_stream".into(), options.wide_stream.to_string()),
+        ("own_pool_scale".into(), options.own_pool_scale.to_string()),
+        ("max_velocity".into(), options.max_velocity.to_string()),
+    ];
+    Ok(model)
+}
+
+/// Loads calibration frames for a graph.
+///
+/// # Errors
+/// Missing or damaged frames.
+pub fn load_frames(graph: &Graph, path: &Path) -> Result<Vec<Frame>> {
+    frames::load(path, &FrameFormat::of_graph(graph))
+}
+
+/// An image and its record.
+#[derive(Clone, Debug)]
+pub struct Compiled {
+    /// The bytes to flash.
+    pub image: Vec<u8>,
+    /// What they were made of.
+    pub record: Record,
+}
+
+/// Plans, packs and emits a quantized model for a target.
+///
+/// # Errors
+/// The model does not fit the target (by how much, and which step is the peak), or the plan fails its own check.
+pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress: Progress<'_>) -> Result<Compiled> {
+    progress("plan", 0, 1);
+    let plan = memory_plan::plan(model, target, options)?;
+    memory_plan::check(model, &plan).map_err(|violations| {
+        Error::new(ErrorCode::Check, "memory plan", violations.join("\n  "))
+            .with_help("this is a defect of the planner")
+    })?;
+    progress("plan", 1, 1);
+    progress("emit", 0, 1);
+    let parts = pack(model, &plan)?;
+    let image = emit(&parts)?;
+    target.fits(model, &plan, image.len() as u64)?;
+    progress("emit", 1, 1);
+    let record =
+        Record { image_sha256: artifact::sha256(&image), target: target.name.clone(), model: model.clone(), plan };
+    Ok(Compiled { image, record })
+}
+
+/// Writes `OUT.img` and `OUT.record`.
+///
+/// # Errors
+/// A file cannot be written; then neither is left half-written.
+pub fn write(compiled: &Compiled, image_path: &Path) -> Result<()> {
+    let record = artifact::to_bytes(&compiled.record)?;
+    artifact::write_file(&record_path(image_path), &record)?;
+    artifact::write_file(image_path, &compiled.image)
+}
+
+/// The record that belongs to an image: the same name with the extension `record`.
+pub fn record_path(image_path: &Path) -> std::path::PathBuf {
+    image_path.with_extension("record")
+}
+
+/// One line per fact about a compiled image, for people.
+pub fn summary(compiled: &Compiled) -> Vec<(String, String)> {
+    let (model, plan) = (&compiled.record.model, &compiled.record.plan);
+    let weights = model.steps.iter().map(|s| s.op.weight_bytes()).sum::<u64>();
+    vec![
+        ("model".into(), format!("{} ({})", model.name, model.system)),
+        ("target".into(), compiled.record.target.clone()),
+        ("steps".into(), model.steps.len().to_string()),
+        (
+            "image".into(),
+            format!(
+                "{} B, {:.4} of its {} B of int8 weights",
+                compiled.image.len(),
+                compiled.image.len() as f64 / weights.max(1) as f64,
+                weights
+            ),
+        ),
+        (
+            "arena".into(),
+            format!(
+                "{} B ({:.3} MiB), bound {} B: {}",
+                plan.arena_bytes,
+                mib(plan.arena_bytes),
+                plan.bound_bytes,
+                plan.status.words()
+            ),
+        ),
+        (
+            "peak".into(),
+            format!("step {} {}", plan.peak_step, model.steps[plan.order[plan.peak_step as usize] as usize].name),
+        ),
+        ("sha256".into(), hex(&compiled.record.image_sha256)),
+    ]
+}
+
+fn mib(bytes: u64) -> f64 {
+    bytes as f64 / f64::from(1 << 20)
+}

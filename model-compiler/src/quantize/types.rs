@@ -1,0 +1,218 @@
+//! Element type, scale and zero point of every value.
+//!
+//! | value | type |
+//! |---|---|
+//! | image, BEV | i8 codes with the fixed scales of the numerics page |
+//! | feature maps, LayerNorm outputs, attention context, MLP hidden | i8 affine |
+//! | queries, keys, values | i8 symmetric |
+//! | residual stream of a transformer | i16, one scale for all its taps |
+//! | skip values of the ResNets | i8 affine, or i16 per stage |
+//! | global pools and the vectors behind them | i16 |
+//! | GRU start state | i16, a power of two |
+//! | velocity, goal, waypoints | fixed point |
+
+use super::QuantizeOptions;
+use super::ranges::{Quantization, affine_i8, symmetric_i8, symmetric_i16};
+use crate::calibrate::Statistics;
+use crate::error::Result;
+use crate::ir::{Graph, InputKind, Node, Op, ValueId};
+use firmware::tensor::ElementType;
+
+/// How one value is stored.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Stored {
+    /// Element type.
+    pub element: ElementType,
+    /// Scale.
+    pub scale: f64,
+    /// Zero point.
+    pub zero_point: i32,
+    /// Calibration values outside the range, per million.
+    pub saturation_ppm: Option<f64>,
+}
+
+impl Stored {
+    /// i8 codes of a quantization.
+    pub fn i8(q: Quantization) -> Self {
+        Self {
+            element: ElementType::I8,
+            scale: q.scale,
+            zero_point: q.zero_point,
+            saturation_ppm: Some(q.saturation_ppm),
+        }
+    }
+
+    fn i16(q: Quantization) -> Self {
+        Self { element: ElementType::I16, ..Self::i8(q) }
+    }
+
+    fn fixed(element: ElementType, scale: f64, zero_point: i32) -> Self {
+        Self { element, scale, zero_point, saturation_ppm: None }
+    }
+}
+
+/// The storage of every value of a graph.
+#[derive(Clone, Debug)]
+pub struct Types(Vec<Stored>);
+
+impl Types {
+    /// Storage of one value.
+    pub fn of(&self, id: ValueId) -> &Stored {
+        &self.0[id.0 as usize]
+    }
+}
+
+/// Role of a value, found from the graph alone.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Role {
+    Input(InputKind),
+    /// An ordinary i8 activation.
+    Narrow,
+    /// Query, key or value of attention.
+    Symmetric,
+    /// Residual stream number k.
+    Stream(usize),
+    /// A value that skips over a residual block.
+    Skip,
+    /// A pooled vector or a vector behind it.
+    Vector,
+    /// Start state of the decoder.
+    Hidden,
+    Waypoints,
+}
+
+/// Decides the storage of every value.
+///
+/// # Errors
+/// None today; the signature leaves room for per-value overrides.
+pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions) -> Result<Types> {
+    let roles = roles(graph);
+    let stages = stages(graph);
+    let stream_maxima = stream_maxima(graph, statistics, options, &roles);
+    let mut types: Vec<Stored> = Vec::with_capacity(graph.values.len());
+    for (index, role) in roles.iter().enumerate() {
+        let id = ValueId(index as u32);
+        let seen = statistics.of(id);
+        let narrow = || Stored::i8(affine_i8(seen, options.ranges));
+        types.push(match *role {
+            Role::Input(InputKind::Image) => Stored::fixed(ElementType::I8, 1.0, -128),
+            Role::Input(InputKind::Bev) => Stored::fixed(ElementType::I8, 0.2, 0),
+            Role::Input(InputKind::Velocity) => Stored::fixed(ElementType::I16, f64::exp2(-8.0), 0),
+            Role::Input(InputKind::Goal) | Role::Waypoints => Stored::fixed(ElementType::I32, f64::exp2(-16.0), 0),
+            Role::Narrow => narrow(),
+            Role::Symmetric => Stored::i8(symmetric_i8(seen, options.ranges)),
+            Role::Stream(k) if options.wide_stream => Stored::i16(symmetric_i16(stream_maxima[k], 2.0)),
+            Role::Stream(_) => narrow(),
+            Role::Skip if options.skip.is_wide(stages[index]) => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
+            Role::Skip => narrow(),
+            Role::Vector => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
+            Role::Hidden => hidden_state(seen.max_abs()),
+        });
+    }
+    same_scale_across_max_pool(graph, &mut types);
+    if !options.own_pool_scale {
+        for node in graph.nodes.iter().filter(|n| matches!(n.op, Op::GlobalPool)) {
+            types[node.output.0 as usize].scale = types[node.inputs[0].0 as usize].scale;
+        }
+    }
+    Ok(Types(types))
+}
+
+/// Start state of the decoder: scale `2^-f`, `f = 15 − max(0, ceil(log2(1.25·max|h0|)))`.
+fn hidden_state(max_abs: f64) -> Stored {
+    let integer_bits = if max_abs > 0.0 { (1.25 * max_abs).log2().ceil().max(0.0) } else { 0.0 };
+    Stored::fixed(ElementType::I16, f64::exp2(integer_bits.min(15.0) - 15.0), 0)
+}
+
+fn roles(graph: &Graph) -> Vec<Role> {
+    let mut roles = vec![Role::Narrow; graph.values.len()];
+    let mut streams = 0;
+    for node in &graph.nodes {
+        let of = |k: usize| node.inputs.get(k).map(|id: &ValueId| roles[id.0 as usize]);
+        let role = match &node.op {
+            Op::Input(kind) => Role::Input(*kind),
+            Op::Tokens(_) => {
+                streams += 1;
+                Role::Stream(streams - 1)
+            }
+            Op::Linear(_) => match (of(0), of(1)) {
+                (_, Some(stream @ Role::Stream(_))) => stream,
+                (Some(Role::Vector), _) => Role::Vector,
+                _ => Role::Narrow,
+            },
+            Op::Add { .. } => match (of(0), of(1)) {
+                (Some(stream @ Role::Stream(_)), _) | (_, Some(stream @ Role::Stream(_))) => stream,
+                _ => Role::Skip,
+            },
+            Op::Conv2d(_) if node.inputs.len() == 2 => Role::Skip,
+            Op::ResizeBilinear { .. } if node.inputs.len() == 2 => Role::Skip,
+            Op::GlobalPool => Role::Vector,
+            Op::WaypointDecoder(_) => Role::Waypoints,
+            _ => Role::Narrow,
+        };
+        roles[node.output.0 as usize] = role;
+    }
+    for node in &graph.nodes {
+        for id in promoted(node) {
+            let role = &mut roles[id.0 as usize];
+            match (&node.op, *role) {
+                (Op::Attention { .. }, Role::Narrow) => *role = Role::Symmetric,
+                (Op::WaypointDecoder(_), _) => *role = Role::Hidden,
+                (Op::Attention { .. }, _) => {}
+                (_, Role::Narrow) => *role = Role::Skip,
+                _ => {}
+            }
+        }
+    }
+    roles
+}
+
+/// Operands whose role is decided by this consumer.
+fn promoted(node: &Node) -> Vec<ValueId> {
+    match &node.op {
+        Op::Attention { .. } => node.inputs.clone(),
+        Op::WaypointDecoder(_) => vec![node.inputs[0]],
+        Op::Conv2d(_) | Op::ResizeBilinear { .. } => node.inputs.iter().skip(1).copied().collect(),
+        Op::MaxPool(_) => vec![node.inputs[0], node.output],
+        _ => Vec::new(),
+    }
+}
+
+/// ResNet stage of every value: the number in a `layerN` name segment, else the largest of its operands'.
+fn stages(graph: &Graph) -> Vec<u8> {
+    let mut stages = vec![0; graph.values.len()];
+    for node in &graph.nodes {
+        let named = node.name.split('.').find_map(|segment| segment.strip_prefix("layer")?.parse().ok());
+        let inherited = node.inputs.iter().map(|id| stages[id.0 as usize]).max().unwrap_or(0);
+        stages[node.output.0 as usize] = named.unwrap_or(inherited);
+    }
+    stages
+}
+
+/// Largest magnitude of each stream over all its taps, with room for the fastest velocity.
+fn stream_maxima(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions, roles: &[Role]) -> Vec<f64> {
+    let count = roles.iter().filter_map(|r| if let Role::Stream(k) = r { Some(k + 1) } else { None }).max();
+    let mut maxima = vec![0.0; count.unwrap_or(0)];
+    for (index, role) in roles.iter().enumerate() {
+        if let Role::Stream(k) = *role {
+            maxima[k] = f64::max(maxima[k], statistics.of(ValueId(index as u32)).max_abs());
+        }
+    }
+    for node in &graph.nodes {
+        if let (Op::Tokens(tokens), Role::Stream(k)) = (&node.op, roles[node.output.0 as usize]) {
+            let unseen = (options.max_velocity - statistics.of(node.inputs[2]).max_abs()).max(0.0);
+            let steepest = tokens.velocity_weights.iter().map(|w| f64::from(w.abs())).fold(0.0, f64::max);
+            maxima[k] += unseen * steepest;
+        }
+    }
+    maxima
+}
+
+/// A max pool copies codes: its output is stored like its input.
+fn same_scale_across_max_pool(graph: &Graph, types: &mut [Stored]) {
+    for node in &graph.nodes {
+        if matches!(node.op, Op::MaxPool(_)) {
+            types[node.output.0 as usize] = types[node.inputs[0].0 as usize];
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! Scaled dot-product attention with heads.
+
+use crate::ir::Shape;
+use rayon::prelude::*;
+
+/// `[query, key, value]`, each `T×C`: softmax(q·kᵀ/√(C/heads))·v per head; head h owns channels `h·C/heads ..`.
+pub(super) fn attention(heads: u16, shape: Shape, inputs: &[&[f32]]) -> Vec<f32> {
+    let &[queries, keys, values] = inputs else { unreachable!("three operands, checked by the shape rule") };
+    let (tokens, channels) = (shape.positions() as usize, usize::from(shape.channels));
+    let depth = channels / usize::from(heads);
+    let columns = transpose(keys, channels);
+    let mut out = vec![0.0; tokens * channels];
+    out.par_chunks_exact_mut(channels).zip(queries.par_chunks_exact(channels)).for_each(|(out, query)| {
+        for (head, context) in out.chunks_exact_mut(depth).enumerate() {
+            let first = head * depth;
+            let mut weights = vec![0.0; tokens];
+            for c in first..first + depth {
+                add_scaled(&mut weights, query[c], &columns[c * tokens..][..tokens]);
+            }
+            softmax(&mut weights, 1.0 / (depth as f64).sqrt());
+            for (&weight, value) in weights.iter().zip(values.chunks_exact(channels)) {
+                add_scaled(context, weight, &value[first..first + depth]);
+            }
+        }
+    });
+    out
+}
+
+/// `T×C` to `C×T`.
+fn transpose(rows: &[f32], channels: usize) -> Vec<f32> {
+    (0..channels).flat_map(|c| rows.iter().skip(c).step_by(channels).copied()).collect()
+}
+
+fn add_scaled(out: &mut [f32], factor: f32, x: &[f32]) {
+    for (out, x) in out.iter_mut().zip(x) {
+        *out += factor * x;
+    }
+}
+
+/// `exp(scale·(x − max))` over its sum, exponentials and sum in f64.
+fn softmax(scores: &mut [f32], scale: f64) {
+    let max = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let powers: Vec<f64> = scores.iter().map(|&x| (scale * (f64::from(x) - f64::from(max))).exp()).collect();
+    let sum: f64 = powers.iter().sum();
+    for (out, power) in scores.iter_mut().zip(powers) {
+        *out = (power / sum) as f32;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{assert_close, values};
+    use super::*;
+
+    /// The definition in f64, one output element at a time.
+    fn naive(heads: usize, tokens: usize, channels: usize, q: &[f32], k: &[f32], v: &[f32]) -> Vec<f64> {
+        let depth = channels / heads;
+        let mut out = Vec::new();
+        for t in 0..tokens {
+            for c in 0..channels {
+                let first = c / depth * depth;
+                let score = |j: usize| {
+                    let product = |i: usize| f64::from(q[t * channels + i]) * f64::from(k[j * channels + i]);
+                    (first..first + depth).map(product).sum::<f64>() / (depth as f64).sqrt()
+                };
+                let sum: f64 = (0..tokens).map(|j| score(j).exp()).sum();
+                out.push((0..tokens).map(|j| score(j).exp() / sum * f64::from(v[j * channels + c])).sum());
+            }
+        }
+        out
+    }
+
+    #[test]
+    fn meets_the_definition() {
+        for (seed, (heads, tokens, depth)) in
+            [(1, 1, 1), (1, 5, 3), (2, 7, 4), (4, 9, 2), (3, 16, 5)].iter().enumerate()
+        {
+            let (seed, channels) = (10 * seed as u64, heads * depth);
+            let [q, k, v] = [1, 2, 3].map(|i| values(seed + i, tokens * channels));
+            // Scores of several units, so that the softmax is far from uniform.
+            let q: Vec<f32> = q.iter().map(|x| 8.0 * x).collect();
+            let shape = Shape::tokens(*tokens as u16, channels as u16);
+            let expected = naive(*heads, *tokens, channels, &q, &k, &v);
+            assert_close(&attention(*heads as u16, shape, &[&q, &k, &v]), &expected, 1e-5);
+        }
+    }
+
+    #[test]
+    fn huge_scores_do_not_overflow() {
+        let found = attention(1, Shape::tokens(2, 1), &[&[1e4, -1e4], &[1e4, -1e4], &[3.0, 5.0]]);
+        assert_eq!(found, [3.0, 5.0]);
+    }
+}

@@ -1,0 +1,289 @@
+//! From a checkpoint's tensors to the optimized float graph, for the published networks and their ablations.
+
+use model_compiler::error::ErrorCode;
+use model_compiler::import::{ImportOptions, NamedTensor, NamedTensors, System, TensorData, import};
+use model_compiler::ir::verify::verify;
+use model_compiler::ir::{Graph, InputKind, Op, Shape};
+use model_compiler::passes::{PassOptions, optimize, optimize_with};
+use tests::golden::{self, Network};
+
+fn import_default(tensors: NamedTensors) -> Graph {
+    let graph = import("model", tensors, &ImportOptions::default()).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(verify(&graph), Ok(()));
+    graph
+}
+
+/// Multiply-accumulates of the nodes whose names start so, in millions with two decimals.
+fn mega_macs(graph: &Graph, prefix: &str) -> f64 {
+    let macs: u64 = graph.nodes.iter().filter(|n| n.name.starts_with(prefix)).map(|n| graph.node_macs(n)).sum();
+    (macs as f64 / 1e4).round() / 100.0
+}
+
+fn count(graph: &Graph, operator: &str) -> usize {
+    graph.nodes.iter().filter(|n| n.op.name() == operator).count()
+}
+
+fn shape_of(graph: &Graph, name: &str) -> Shape {
+    graph.value(graph.find(name).unwrap_or_else(|| panic!("no value {name}"))).shape
+}
+
+#[test]
+fn published_checkpoints_have_the_published_sizes() {
+    for (system, parameters, giga_macs) in [
+        (System::Aim, 21_470_722, 4.785),
+        (System::LateFusion, 32_644_098, 7.102),
+        (System::TransFuser, 66_293_634, 11.632),
+    ] {
+        let mut graph = import_default(golden::checkpoint(system));
+        assert_eq!(graph.system, system.name());
+        assert_eq!(graph.parameters(), parameters, "{}", system.name());
+        assert_eq!((graph.macs() as f64 / 1e6).round() / 1e3, giga_macs, "{}", system.name());
+        assert_eq!(shape_of(&graph, "waypoints"), Shape::tokens(4, 2));
+        let taps = golden::expected(system).taps;
+        let macs = graph.macs();
+        for optimized in [false, true] {
+            for (module, frames) in &taps {
+                let value = golden::tapped_value(&graph, module).unwrap_or_else(|| panic!("no value for {module}"));
+                assert_eq!(usize::from(graph.value(value).shape.channels), frames[0].len(), "{module}");
+            }
+            if !optimized {
+                optimize(&mut graph).unwrap_or_else(|e| panic!("{e}"));
+                assert_eq!(graph.macs(), macs, "folding and fusing leaves the products as they are");
+            }
+        }
+    }
+}
+
+#[test]
+fn parts_of_transfuser_cost_what_the_specification_says() {
+    let graph = import_default(Network::published(System::TransFuser).zeros());
+    for (prefix, expected) in [
+        ("encoder.image_encoder.features.conv1", 154.14),
+        ("encoder.image_encoder.features.layer1", 905.97),
+        ("encoder.image_encoder.features.layer2", 1140.85),
+        ("encoder.image_encoder.features.layer3", 1744.83),
+        ("encoder.image_encoder.features.layer4", 838.86),
+        ("encoder.lidar_encoder._model", 2317.35),
+        ("encoder.transformer1", 67.11),
+        ("encoder.transformer2", 234.88),
+        ("encoder.transformer3", 872.42),
+        ("encoder.transformer4", 3355.44),
+        ("join", 0.17),
+        ("waypoints", 0.05),
+    ] {
+        assert_eq!(mega_macs(&graph, prefix), expected, "{prefix}");
+    }
+}
+
+#[test]
+fn ablations_have_the_sizes_of_the_paper() {
+    let base = Network::published(System::TransFuser);
+    for (what, network, parameters, giga_macs) in [
+        ("scale 1", Network { scales: vec![4], ..base.clone() }, 57_930_370, 10.458),
+        ("scale 2", Network { scales: vec![3, 4], ..base.clone() }, 64_282_242, 11.330),
+        ("scale 3", Network { scales: vec![2, 3, 4], ..base.clone() }, 65_885_314, 11.565),
+        ("1 attention layer", Network { layers: 1, ..base.clone() }, 36_960_834, 7.668),
+        ("4 attention layers", Network { layers: 4, ..base.clone() }, 49_532_034, 9.367),
+        ("no positional embedding", Network { position: false, ..base.clone() }, 66_170_754, 11.632),
+    ] {
+        let mut graph = import_default(network.zeros());
+        assert_eq!(graph.parameters(), parameters, "{what}");
+        assert_eq!((graph.macs() as f64 / 1e6).round() / 1e3, giga_macs, "{what}");
+        optimize(&mut graph).unwrap_or_else(|e| panic!("{what}: {e}"));
+        assert_eq!(count(&graph, "tokens"), network.scales.len(), "{what}");
+    }
+}
+
+#[test]
+fn transfuser_without_any_scale_has_no_velocity_input() {
+    let graph = import_default(Network { scales: vec![], ..Network::small(System::TransFuser) }.zeros());
+    assert!(graph.inputs().all(|(_, kind)| kind != InputKind::Velocity));
+}
+
+#[test]
+fn sizes_come_from_the_tensors() {
+    let network = Network {
+        stem: 12,
+        widths: [8, 16, 20, 28],
+        image_blocks: [1, 3, 2, 1],
+        lidar_blocks: [2, 1, 1, 3],
+        layers: 3,
+        grid: (3, 3),
+        scales: vec![2, 4],
+        join: vec![40, 20, 12, 6],
+        gru_inputs: 4,
+        ..Network::small(System::TransFuser)
+    };
+    let graph = import_default(network.tensors());
+    assert_eq!(shape_of(&graph, "rgb"), Shape::map(96, 96, 3));
+    assert_eq!(shape_of(&graph, "bev"), Shape::map(96, 96, 2));
+    assert_eq!(shape_of(&graph, "encoder.image_encoder.features.maxpool"), Shape::map(24, 24, 12));
+    assert_eq!(shape_of(&graph, "encoder.image_encoder.features.layer2.2"), Shape::map(12, 12, 16));
+    assert_eq!(shape_of(&graph, "encoder.lidar_encoder._model.layer4.2"), Shape::map(3, 3, 28));
+    assert_eq!(shape_of(&graph, "encoder.transformer2.blocks.2"), Shape::tokens(18, 16));
+    assert_eq!(shape_of(&graph, "encoder.transformer2.upsample.lidar"), Shape::map(12, 12, 16));
+    assert!(graph.find("encoder.transformer4.upsample.image").is_none(), "nothing to enlarge at the last stage");
+    assert_eq!(shape_of(&graph, "join.7"), Shape::vector(6));
+    // The stem is wider than the first stage, so that stage projects its shortcut too.
+    assert!(graph.find("encoder.image_encoder.features.layer1.0.downsample.0").is_some());
+}
+
+#[test]
+fn inputs_and_outputs_have_their_names() {
+    for (system, inputs) in [
+        (System::Aim, vec!["rgb", "goal"]),
+        (System::LateFusion, vec!["rgb", "bev", "goal"]),
+        (System::TransFuser, vec!["rgb", "bev", "velocity", "goal"]),
+    ] {
+        let network = Network::small(system);
+        let options = ImportOptions { resolution: Some(network.resolution()), ..Default::default() };
+        let mut graph = import("small", network.tensors(), &options).unwrap();
+        for _ in 0..2 {
+            assert_eq!(graph.inputs().map(|(id, _)| graph.value(id).name.as_str()).collect::<Vec<_>>(), inputs);
+            assert_eq!(graph.outputs, [graph.find("waypoints").unwrap()]);
+            assert_eq!(shape_of(&graph, "rgb"), Shape::map(64, 64, 3));
+            optimize(&mut graph).unwrap();
+        }
+    }
+}
+
+#[test]
+fn optimized_transfuser_consists_of_fused_operators() {
+    let mut graph = import_default(Network::published(System::TransFuser).zeros());
+    optimize(&mut graph).unwrap();
+    for (operator, expected) in [
+        ("normalize", 0),
+        ("batch_norm", 0),
+        ("relu", 0),
+        ("conv2d", 36 + 20),
+        ("max_pool", 2),
+        ("tokens", 4),
+        ("layer_norm", 4 * (2 * 8 + 2)),
+        ("linear", 4 * 8 * 6 + 3),
+        ("attention", 4 * 8),
+        ("resize_bilinear", 6),
+        // The last stage's two fusion additions: LayerNorm takes no residual.
+        ("add", 2),
+        ("global_pool", 1),
+        ("waypoint_decoder", 1),
+    ] {
+        assert_eq!(count(&graph, operator), expected, "{operator}");
+    }
+    assert_eq!(graph.values.len(), graph.nodes.len(), "no dead values");
+    let block = graph.producer(graph.find("encoder.image_encoder.features.layer2.0").unwrap()).unwrap();
+    assert!(matches!(&block.op, Op::Conv2d(c) if c.relu && c.window.kernel_h == 3));
+    assert_eq!(graph.value(block.inputs[1]).name, "encoder.image_encoder.features.layer2.0.downsample.1");
+    let normalized = |name: &str| match &graph.producer(graph.find(name).unwrap()).unwrap().op {
+        Op::Conv2d(conv) => conv.normalization.clone(),
+        op => panic!("{name} is a {}", op.name()),
+    };
+    let image = normalized("encoder.image_encoder.features.relu").expect("raw camera image");
+    assert_eq!((&image.mean[..], &image.std[..]), (&[0.485, 0.456, 0.406][..], &[0.229, 0.224, 0.225][..]));
+    assert_eq!(normalized("encoder.lidar_encoder._model.relu"), None, "counts are scaled by their input");
+}
+
+#[test]
+fn residuals_stay_additions_when_switched_off() {
+    let mut graph = import_default(Network::small(System::TransFuser).tensors());
+    optimize_with(&mut graph, PassOptions { fuse_residual: false }).unwrap();
+    let with_residual = |kind: &str| graph.nodes.iter().filter(|n| n.op.name() == kind && n.inputs.len() == 2).count();
+    assert_eq!((with_residual("conv2d"), with_residual("linear"), with_residual("resize_bilinear")), (0, 0, 6));
+    assert_eq!(count(&graph, "add"), 5 + 4 + 4 * 2 * 2 + 2);
+    assert_eq!(count(&graph, "relu"), 0);
+}
+
+fn spoil(tensors: &mut NamedTensors, name: &str, change: impl FnOnce(&mut Vec<f32>)) {
+    match tensors.get_mut(name) {
+        Some(NamedTensor { data: TensorData::Float(values), .. }) => change(values),
+        _ => panic!("no float tensor {name}"),
+    }
+}
+
+fn floats(shape: &[usize]) -> NamedTensor {
+    NamedTensor { shape: shape.to_vec(), data: TensorData::Float(vec![0.5; shape.iter().product()]) }
+}
+
+#[test]
+fn all_wrong_tensors_are_listed_at_once() {
+    let mut tensors = Network::small(System::TransFuser).tensors();
+    tensors.remove("encoder.image_encoder.features.layer2.0.bn1.running_mean");
+    tensors.remove("encoder.transformer3.blocks.1.attn.query.weight");
+    tensors.insert("encoder.lidar_encoder._model.layer3.0.conv2.weight", floats(&[24, 24, 1, 1]));
+    tensors.insert("encoder.image_encoder.features.fc.weight", floats(&[1000, 32]));
+    tensors.insert("join.2.bias", floats(&[17]));
+    tensors.insert("output.bias", NamedTensor { shape: vec![2], data: TensorData::Integer });
+    spoil(&mut tensors, "decoder.weight_hh", |v| v[7] = f32::NAN);
+    spoil(&mut tensors, "encoder.transformer1.pos_emb", |v| v[3] = f32::INFINITY);
+    spoil(&mut tensors, "encoder.image_encoder.features.bn1.running_var", |v| v[2] = -1.0);
+    let error = import("model.pth", tensors, &ImportOptions::default()).unwrap_err();
+    assert_eq!(error.code, ErrorCode::Tensors);
+    let expected = "\
+model.pth: 9 tensors do not fit the system transfuser:
+  encoder.image_encoder.features.bn1.running_var            negative variance at index 2  expected [8]
+  encoder.transformer1.pos_emb                              inf at index 3                expected [1, 8, 8]
+  encoder.image_encoder.features.layer2.0.bn1.running_mean  missing                       expected [16]
+  encoder.lidar_encoder._model.layer3.0.conv2.weight        found [24, 24, 1, 1]          expected [24, 24, 3, 3]
+  encoder.transformer3.blocks.1.attn.query.weight           missing                       expected [24, 24]
+  join.2.bias                                               found [17]                    expected [16]
+  decoder.weight_hh                                         NaN at index 7                expected [48, 16]
+  output.bias                                               found integers [2]            expected [2]
+  encoder.image_encoder.features.fc.weight                  found [1000, 32]              surplus
+  help: the checkpoint must hold exactly the network's tensors; --system overrides the detection";
+    assert_eq!(error.to_string(), expected);
+}
+
+#[test]
+fn missing_whole_parts_are_listed_and_the_list_is_cut() {
+    let mut tensors = Network::small(System::TransFuser).tensors();
+    let names: Vec<_> = tensors.under("encoder.image_encoder.").map(|(name, _)| name.to_string()).collect();
+    names.iter().for_each(|name| drop(tensors.remove(name)));
+    let text = import("model.pth", tensors, &ImportOptions::default()).unwrap_err().to_string();
+    assert!(text.starts_with("model.pth: 60 tensors do not fit the system transfuser:\n"), "{text}");
+    assert!(text.contains("features.layer4.0.conv1.weight               missing  expected [32, 24, 3, 3]\n"), "{text}");
+    assert!(text.contains("\n  … and 10 more\n  help: "), "{text}");
+    assert_eq!(text.lines().count(), 1 + 50 + 2);
+}
+
+#[test]
+fn surplus_counters_are_no_problem_and_other_leftovers_are() {
+    let mut tensors = Network::small(System::Aim).tensors();
+    tensors.insert("other.num_batches_tracked", NamedTensor { shape: vec![], data: TensorData::Integer });
+    import("model", tensors.clone(), &ImportOptions::default()).unwrap();
+    tensors.insert("step", NamedTensor { shape: vec![], data: TensorData::Integer });
+    let error = import("model", tensors, &ImportOptions::default()).unwrap_err();
+    assert_eq!(error.message, "1 tensor does not fit the system aim:\n  step  found []  surplus");
+}
+
+#[test]
+fn unfitting_options_are_refused_by_name() {
+    let tensors = Network::small(System::TransFuser).tensors();
+    let heads = ImportOptions { heads: 3, ..Default::default() };
+    let error = import("m", tensors.clone(), &heads).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "m: attention encoder.transformer1.blocks.0.attn.context: 8 channels are not divisible by 3 heads"
+    );
+    let resolution = ImportOptions { resolution: Some((128, 64)), ..Default::default() };
+    let error = import("m", tensors.clone(), &resolution).unwrap_err();
+    assert!(error.message.contains("encoder.transformer4.pos_emb  found [1, 8, 32]  expected [1, 16, 32]"), "{error}");
+    let resolution = ImportOptions { resolution: Some((72, 64)), ..Default::default() };
+    let error = import("m", tensors, &resolution).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "m: an input of 72×64 pixels does not divide into tokens\n  \
+         help: height and width must be multiples of 32 pixels"
+    );
+}
+
+#[test]
+fn generated_checkpoint_is_finite_and_its_statistics_are_positive() {
+    let network = Network::small(System::TransFuser);
+    let tensors = network.tensors();
+    assert_eq!(tensors.len(), network.shapes().len());
+    for (name, tensor) in tensors.iter() {
+        if let TensorData::Float(values) = &tensor.data {
+            assert!(values.iter().all(|v| v.is_finite()), "{name}");
+            assert!(!name.ends_with("running_var") || values.iter().all(|&v| v > 0.0), "{name}");
+        }
+    }
+}

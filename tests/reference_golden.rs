@@ -1,0 +1,106 @@
+//! The f32 reference meets what the original networks gave: waypoints and the means of inner features, at full size,
+//! for the graph as imported and as optimized.
+
+use model_compiler::import::{ImportOptions, System, import};
+use model_compiler::ir::{Graph, InputKind, ValueId};
+use model_compiler::metrics::max_abs_error;
+use model_compiler::{passes, reference};
+use std::collections::BTreeMap;
+use tests::golden::{self, Expected, Frame};
+
+/// Meters.
+const WAYPOINT_TOLERANCE: f32 = 1e-3;
+
+/// Of the expected mean, or of [`TAP_FLOOR`] times the largest mean of the same tap and frame where that is more: a
+/// mean of signed features may cancel to nothing, and then has no relative error.
+const TAP_TOLERANCE: f32 = 1e-3;
+const TAP_FLOOR: f32 = 1e-2;
+
+fn raw_inputs(graph: &Graph, frame: &Frame) -> Vec<Vec<f32>> {
+    let raw = |kind| match kind {
+        InputKind::Image => frame.rgb.clone(),
+        InputKind::Bev => frame.bev.clone(),
+        InputKind::Velocity => vec![frame.velocity],
+        InputKind::Goal => frame.target.to_vec(),
+    };
+    graph.inputs().map(|(_, kind)| raw(kind)).collect()
+}
+
+/// Mean over all positions, per channel.
+fn spatial_mean(map: &[f32], channels: usize) -> Vec<f32> {
+    let positions = (map.len() / channels) as f64;
+    let sum = |c: usize| map.iter().skip(c).step_by(channels).map(|&x| f64::from(x)).sum::<f64>();
+    (0..channels).map(|c| (sum(c) / positions) as f32).collect()
+}
+
+/// Largest error of the channels, as a part of what [`TAP_FLOOR`] says.
+fn tap_error(found: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(found.len(), expected.len(), "channels");
+    let floor = TAP_FLOOR * expected.iter().fold(0.0_f32, |max, e| max.max(e.abs()));
+    let errors = found.iter().zip(expected).map(|(f, e)| (f - e).abs() / e.abs().max(floor));
+    errors.fold(0.0, |worst, e| if e > worst || e.is_nan() { e } else { worst })
+}
+
+/// False for an error that is not a number.
+fn within(error: f32, tolerance: f32) -> bool {
+    error <= tolerance
+}
+
+/// Runs all frames; prints the worst errors, panics with all that are too large.
+fn check(what: &str, graph: &Graph, frames: &[Frame], expected: &Expected) {
+    let taps: BTreeMap<ValueId, &str> = expected
+        .taps
+        .keys()
+        .map(|module| {
+            (golden::tapped_value(graph, module).unwrap_or_else(|| panic!("{what}: no {module}")), &module[..])
+        })
+        .collect();
+    let mut misses = Vec::new();
+    let (mut worst_tap, mut worst_waypoint) = (0.0_f32, 0.0_f32);
+    for (i, frame) in frames.iter().enumerate() {
+        let mut seen = 0;
+        let outputs = reference::run(graph, &raw_inputs(graph, frame), |node, map| {
+            let Some(module) = taps.get(&node.output) else { return };
+            let means = spatial_mean(map, usize::from(graph.value(node.output).shape.channels));
+            let error = tap_error(&means, &expected.taps[*module][i]);
+            seen += 1;
+            worst_tap = worst_tap.max(error);
+            if !within(error, TAP_TOLERANCE) {
+                misses.push(format!("frame {i}, {module}: off by {error:.1e}"));
+            }
+        })
+        .unwrap_or_else(|e| panic!("{what}: {e}"));
+        assert_eq!(seen, expected.taps.len(), "{what}: every tap is computed");
+        let waypoints = expected.waypoints[i].as_flattened();
+        let error = max_abs_error(waypoints, &outputs[0]) as f32;
+        worst_waypoint = worst_waypoint.max(error);
+        if !within(error, WAYPOINT_TOLERANCE) {
+            misses.push(format!("frame {i}: waypoints {:?}, expected {waypoints:?}", outputs[0]));
+        }
+    }
+    println!("{what}: waypoints within {worst_waypoint:.1e} m, inner features within {worst_tap:.1e}");
+    assert!(misses.is_empty(), "{what}:\n{}", misses.join("\n"));
+}
+
+fn meets_the_original(system: System) {
+    let (frames, expected) = (golden::frames(), golden::expected(system));
+    let mut graph = import(system.name(), golden::checkpoint(system), &ImportOptions::default()).unwrap();
+    check(&format!("{}, as imported", system.name()), &graph, &frames, &expected);
+    passes::optimize(&mut graph).unwrap();
+    check(&format!("{}, optimized", system.name()), &graph, &frames, &expected);
+}
+
+#[test]
+fn aim_meets_the_original() {
+    meets_the_original(System::Aim);
+}
+
+#[test]
+fn late_fusion_meets_the_original() {
+    meets_the_original(System::LateFusion);
+}
+
+#[test]
+fn transfuser_meets_the_original() {
+    meets_the_original(System::TransFuser);
+}

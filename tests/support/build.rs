@@ -1,0 +1,84 @@
+//! From a described network to an image, with the stored frames as calibration.
+
+use crate::golden::{self, Network};
+use model_compiler::frames::{ByteMap, Frame};
+use model_compiler::import::{ImportOptions, NamedTensors, import};
+use model_compiler::ir::{Graph, Shape};
+use model_compiler::memory_plan::PlanOptions;
+use model_compiler::passes::{PassOptions, optimize_with};
+use model_compiler::pipeline::{self, Compiled};
+use model_compiler::qmodel::QModel;
+use model_compiler::quantize::QuantizeOptions;
+use model_compiler::target::Target;
+
+/// The optimized graph of a checkpoint.
+///
+/// # Panics
+/// The checkpoint is refused.
+pub fn graph(tensors: NamedTensors) -> Graph {
+    graph_with(tensors, PassOptions::default())
+}
+
+/// The graph of a checkpoint, optimized with these switches.
+///
+/// # Panics
+/// The checkpoint is refused.
+pub fn graph_with(tensors: NamedTensors, passes: PassOptions) -> Graph {
+    let mut graph = import("network", tensors, &ImportOptions::default()).unwrap_or_else(|e| panic!("{e}"));
+    optimize_with(&mut graph, passes).unwrap_or_else(|e| panic!("{e}"));
+    graph
+}
+
+/// The stored frames, cropped to a network's resolution.
+pub fn frames((height, width): (u16, u16)) -> Vec<Frame> {
+    let bytes = |values: &[f32], channels: u16| ByteMap {
+        shape: Shape::map(height, width, channels),
+        data: values.iter().map(|&v| v as u8).collect(),
+    };
+    golden::frames()
+        .iter()
+        .enumerate()
+        .map(|(i, full)| {
+            let frame = full.cropped(height.into(), width.into());
+            Frame {
+                name: format!("golden {i}"),
+                rgb: Some(bytes(&frame.rgb, 3)),
+                bev: Some(bytes(&frame.bev, 2)),
+                velocity: Some(frame.velocity.into()),
+                goal: Some(frame.target.map(f64::from)),
+                command: Some(frame.command as u8),
+                dropped_points: 0,
+            }
+        })
+        .collect()
+}
+
+/// The frames of a graph: of the size of its image input.
+pub fn frames_of(graph: &Graph) -> Vec<Frame> {
+    let (image, _) = graph.inputs().next().expect("a graph has inputs");
+    let shape = graph.value(image).shape;
+    frames((shape.height, shape.width))
+}
+
+/// Quantizes a graph on the stored frames.
+///
+/// # Panics
+/// The quantizer refuses it.
+pub fn quantized(graph: &Graph, options: &QuantizeOptions) -> QModel {
+    pipeline::quantize_graph(graph, &frames_of(graph), options, &mut |_, _, _| {}).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// Compiles a quantized model for the portable target.
+///
+/// # Panics
+/// The compiler refuses it.
+pub fn compiled(model: &QModel) -> Compiled {
+    let target = Target::find("portable").unwrap_or_else(|e| panic!("{e}"));
+    let options = PlanOptions::for_target(&target);
+    pipeline::compile(model, &target, &options, &mut |_, _, _| {}).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// A small network of a system, ready to compile.
+pub fn small(network: &Network) -> Graph {
+    graph(network.tensors())
+}

@@ -1,0 +1,220 @@
+//! Checkpoints of any size: the tensor names and shapes of a described network, with generated values.
+
+use super::{generate, uniform};
+use model_compiler::import::{NamedTensor, NamedTensors, System, TensorData};
+
+/// Sizes of a network; the published ones, small ones for fast tests, or an ablation of either.
+#[derive(Clone, Debug)]
+pub struct Network {
+    /// Which of the three waypoint systems.
+    pub system: System,
+    /// Channels of stem and first stage.
+    pub stem: usize,
+    /// Channels per stage.
+    pub widths: [usize; 4],
+    /// Blocks per stage of the image network.
+    pub image_blocks: [usize; 4],
+    /// Blocks per stage of the LiDAR network.
+    pub lidar_blocks: [usize; 4],
+    /// Layers of each transformer.
+    pub layers: usize,
+    /// Token grid, height and width; the input has 32 times the size.
+    pub grid: (usize, usize),
+    /// Whether there are positional embeddings.
+    pub position: bool,
+    /// Fusion scales, of 1..=4.
+    pub scales: Vec<u8>,
+    /// Outputs of the join layers; the last is the hidden size of the GRU.
+    pub join: Vec<usize>,
+    /// Input width of the GRU: 2 (added) or 4 (concatenated).
+    pub gru_inputs: usize,
+}
+
+impl Network {
+    /// The system as published.
+    pub fn published(system: System) -> Self {
+        Self {
+            system,
+            stem: 64,
+            widths: [64, 128, 256, 512],
+            image_blocks: [3, 4, 6, 3],
+            lidar_blocks: [2; 4],
+            layers: 8,
+            grid: (8, 8),
+            position: true,
+            scales: vec![1, 2, 3, 4],
+            join: vec![256, 128, 64],
+            gru_inputs: if system == System::TransFuser { 2 } else { 4 },
+        }
+    }
+
+    /// The system with one or two blocks per stage, few channels, and an input of 64×64.
+    pub fn small(system: System) -> Self {
+        Self {
+            stem: 8,
+            widths: [8, 16, 24, 32],
+            image_blocks: [2, 1, 1, 1],
+            lidar_blocks: [1; 4],
+            layers: 2,
+            grid: (2, 2),
+            join: vec![24, 16],
+            ..Self::published(system)
+        }
+    }
+
+    /// Height and width of the input, pixels.
+    pub fn resolution(&self) -> (u16, u16) {
+        (32 * self.grid.0 as u16, 32 * self.grid.1 as u16)
+    }
+
+    /// Names and shapes of the checkpoint.
+    pub fn shapes(&self) -> Vec<(String, Vec<usize>)> {
+        let mut list = List(Vec::new());
+        let root = if self.system == System::TransFuser { "encoder." } else { "" };
+        self.resnet(&mut list, &format!("{root}image_encoder.features"), 3, &self.image_blocks);
+        if self.system != System::Aim {
+            self.resnet(&mut list, &format!("{root}lidar_encoder._model"), 2, &self.lidar_blocks);
+        }
+        if self.system == System::TransFuser {
+            self.scales.iter().for_each(|&scale| self.transformer(&mut list, scale));
+        }
+        self.head(&mut list);
+        list.0
+    }
+
+    /// Generated values with plausible batch-norm statistics: activations stay of order 1 on real frames.
+    pub fn tensors(&self) -> NamedTensors {
+        let shapes = self.shapes();
+        let mut tensors = generate(&shapes);
+        for (name, shape) in &shapes {
+            let Some((norm, leaf)) = name.rsplit_once('.') else { continue };
+            let variance = typical_variance(norm);
+            let (base, amplitude) = match leaf {
+                "running_var" => (variance, 0.25 * variance),
+                "running_mean" => (0.0, 0.3 * variance.sqrt()),
+                _ => continue,
+            };
+            let data = TensorData::Float(uniform(name, shape[0]).map(|u| base + amplitude * u).collect());
+            tensors.insert(name, NamedTensor { shape: shape.clone(), data });
+        }
+        tensors
+    }
+
+    /// All values zero: enough where only names and shapes matter.
+    pub fn zeros(&self) -> NamedTensors {
+        let (counters, floats): (Vec<_>, Vec<_>) =
+            self.shapes().into_iter().partition(|(name, _)| name.ends_with("num_batches_tracked"));
+        let fill = |(name, shape): (String, Vec<usize>)| {
+            let values = vec![0.0; shape.iter().product()];
+            (name, shape, values)
+        };
+        NamedTensors::new(floats.into_iter().map(fill), counters)
+    }
+
+    fn resnet(&self, list: &mut List, prefix: &str, channels: usize, blocks: &[usize; 4]) {
+        list.add(format!("{prefix}.conv1.weight"), &[self.stem, channels, 7, 7]);
+        list.batch_norm(&format!("{prefix}.bn1"), self.stem);
+        let mut input = self.stem;
+        for (stage, (&width, &count)) in self.widths.iter().zip(blocks).enumerate() {
+            for block in 0..count {
+                let module = format!("{prefix}.layer{}.{block}", stage + 1);
+                list.add(format!("{module}.conv1.weight"), &[width, input, 3, 3]);
+                list.batch_norm(&format!("{module}.bn1"), width);
+                list.add(format!("{module}.conv2.weight"), &[width, width, 3, 3]);
+                list.batch_norm(&format!("{module}.bn2"), width);
+                if block == 0 && (stage > 0 || input != width) {
+                    list.add(format!("{module}.downsample.0.weight"), &[width, input, 1, 1]);
+                    list.batch_norm(&format!("{module}.downsample.1"), width);
+                }
+                input = width;
+            }
+        }
+    }
+
+    fn transformer(&self, list: &mut List, scale: u8) {
+        let prefix = format!("encoder.transformer{scale}");
+        let c = self.widths[usize::from(scale) - 1];
+        if self.position {
+            list.add(format!("{prefix}.pos_emb"), &[1, 2 * self.grid.0 * self.grid.1, c]);
+        }
+        list.linear(&format!("{prefix}.vel_emb"), c, 1);
+        for layer in 0..self.layers {
+            let module = format!("{prefix}.blocks.{layer}");
+            list.norm(&format!("{module}.ln1"), c);
+            list.norm(&format!("{module}.ln2"), c);
+            for leaf in ["key", "query", "value", "proj"] {
+                list.linear(&format!("{module}.attn.{leaf}"), c, c);
+            }
+            list.linear(&format!("{module}.mlp.0"), 4 * c, c);
+            list.linear(&format!("{module}.mlp.2"), c, 4 * c);
+        }
+        list.norm(&format!("{prefix}.ln_f"), c);
+    }
+
+    fn head(&self, list: &mut List) {
+        let mut input = self.widths[3];
+        for (layer, &width) in self.join.iter().enumerate() {
+            list.linear(&format!("join.{}", 2 * layer), width, input);
+            input = width;
+        }
+        list.add("decoder.weight_ih".into(), &[3 * input, self.gru_inputs]);
+        list.add("decoder.weight_hh".into(), &[3 * input, input]);
+        list.add("decoder.bias_ih".into(), &[3 * input]);
+        list.add("decoder.bias_hh".into(), &[3 * input]);
+        list.linear("output", 2, input);
+    }
+}
+
+/// Means over the statistics that the published networks show with generated weights: the images' raw range makes the
+/// first one large, the sparse LiDAR histogram small; elsewhere inputs are of order 1.
+fn typical_variance(norm: &str) -> f32 {
+    if norm.ends_with("features.bn1") {
+        3e5
+    } else if norm.ends_with("_model.bn1") {
+        0.02
+    } else if norm.ends_with("bn2") {
+        0.7
+    } else {
+        2.0
+    }
+}
+
+struct List(Vec<(String, Vec<usize>)>);
+
+impl List {
+    fn add(&mut self, name: String, shape: &[usize]) {
+        self.0.push((name, shape.to_vec()));
+    }
+
+    fn linear(&mut self, module: &str, outputs: usize, inputs: usize) {
+        self.add(format!("{module}.weight"), &[outputs, inputs]);
+        self.add(format!("{module}.bias"), &[outputs]);
+    }
+
+    fn norm(&mut self, module: &str, channels: usize) {
+        self.add(format!("{module}.weight"), &[channels]);
+        self.add(format!("{module}.bias"), &[channels]);
+    }
+
+    fn batch_norm(&mut self, module: &str, channels: usize) {
+        self.norm(module, channels);
+        self.add(format!("{module}.running_mean"), &[channels]);
+        self.add(format!("{module}.running_var"), &[channels]);
+        self.add(format!("{module}.num_batches_tracked"), &[]);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::golden;
+
+    #[test]
+    fn published_networks_have_the_published_names_and_shapes() {
+        for system in [System::Aim, System::LateFusion, System::TransFuser] {
+            let mut shapes = Network::published(system).shapes();
+            shapes.sort();
+            assert_eq!(shapes, golden::shapes(system), "{}", system.name());
+        }
+    }
+}
