@@ -175,10 +175,9 @@ pub fn assemble(parts: &ImageParts) -> Result<Vec<u8>> {
 /// As [`emit`]; also where `image` is no image.
 pub fn with_known_answer(image: &[u8], known_answer: Option<&KnownAnswer>) -> Result<Vec<u8>> {
     let aligned = AlignedBytes::from(image);
-    let parsed = Image::parse(&aligned).map_err(|error| malformed("image", error.to_string()))?;
-    let end = to_u32(parsed.section(SectionKind::KnownAnswer).len())
-        .map(|_| slot_field(image, SectionKind::KnownAnswer, section::OFFSET))?;
-    let mut bytes = image[..end as usize].to_vec();
+    Image::parse(&aligned).map_err(|error| malformed("image", error.to_string()))?;
+    let start = slot_field(image, SectionKind::KnownAnswer, section::OFFSET) as usize;
+    let mut bytes = image[..start].to_vec();
     append_section(&mut bytes, SectionKind::KnownAnswer, &known_answer_section(known_answer))?;
     let total = to_u32(bytes.len())?;
     bytes[header::TOTAL_BYTES].copy_from_slice(&total.to_le_bytes());

@@ -3,4 +3,5 @@
 pub mod build;
 pub mod bundle;
 pub mod golden;
+pub mod project;
 pub mod torch_file;
