@@ -16,7 +16,7 @@ use std::ops::Range;
 use std::path::Path;
 use tests::bundle;
 
-const PARAMETERS: u64 = 0;
+const PARAMETERS: u64 = 1_360_594;
 /// Of 256 KiB: the rest is for stack and sensor buffers.
 const MAX_ARENA_BYTES: u64 = 240 * 1024;
 /// Every file of the checkpoint's folder and of the frames.

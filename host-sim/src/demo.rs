@@ -90,7 +90,7 @@ impl Bundle {
 /// # Errors
 /// A bundled file is damaged, or `out` cannot be written.
 pub fn demo(bundle: &Bundle, out: &Path, progress: &ProgressBar, say: &mut dyn FnMut(&str)) -> Result<VerifyReport> {
-    say(&format!("{NOTICE}\n"));
+    say(NOTICE);
     let graph = files::load_graph(&bundle.checkpoint(), &ImportOptions::default())?;
     say(&imported(bundle, &graph));
     let model = quantized(bundle, &graph, progress, say)?;
@@ -117,8 +117,8 @@ pub fn document(report: &VerifyReport) -> Value {
 
 fn imported(bundle: &Bundle, graph: &Graph) -> String {
     format!(
-        "import     {}: {} parameters, {:.1} million multiply-accumulates",
-        bundle.show(&bundle.checkpoint()),
+        "\nimport     {}: {} parameters, {:.1} million multiply-accumulates",
+        shown(&bundle.checkpoint()),
         graph.parameters(),
         graph.macs() as f64 / 1e6
     )
@@ -129,7 +129,7 @@ fn quantized(bundle: &Bundle, graph: &Graph, progress: &ProgressBar, say: &mut d
     let frames = pipeline::load_frames(graph, &folder)?;
     let mut show = |stage: &str, done: usize, total: usize| show_stage(progress, stage, done, total);
     let model = pipeline::quantize_graph(graph, &frames, &QuantizeOptions::default(), &mut show)?;
-    say(&format!("calibrate  {} frames of {}", frames.len(), bundle.show(&folder)));
+    say(&format!("calibrate  {} frames of {}", frames.len(), shown(&folder)));
     say(&format!("quantize   {} tensors, {} integer steps", model.tensors.len(), model.steps.len()));
     Ok(model)
 }
@@ -154,28 +154,27 @@ fn verified(bundle: &Bundle, image: PathBuf, progress: &ProgressBar) -> Result<V
 }
 
 fn results(bundle: &Bundle, out: &Path, report: &VerifyReport) -> String {
-    let frames = bundle.show(&bundle.frames("evaluation"));
+    let frames = shown(&bundle.frames("evaluation"));
     let pooled = report.steps.iter().find(|step| step.op == "global_pool").and_then(|step| step.sqnr_db);
     let pooled = pooled.map(|db| format!("pooled vector          {db:.1} dB\n")).unwrap_or_default();
     format!(
         "verify     {} frames: those of {frames} and their mirror images\n\n\
          Waypoints in meters (of an untrained network: they mean nothing)\n\n{}\n\n{}{pooled}\n\
          Written to {}: demo.img (to flash), demo.record (what it is made of), report.json (every step)\n\
-         Again by hand: host-sim verify {} --model {} --frames {frames}",
+         Once more by hand: cargo run --release -p host-sim -- verify {} --model {} --frames {frames}",
         report.frames.len(),
         terminal::waypoints(&report.frames),
         terminal::summary(report),
-        bundle.show(out),
-        bundle.show(&out.join("demo.img")),
-        bundle.show(&bundle.checkpoint()),
+        shown(out),
+        shown(&out.join("demo.img")),
+        shown(&bundle.checkpoint()),
     )
 }
 
-impl Bundle {
-    /// A path as people read it: from the root of the workspace, if it lies there.
-    fn show(&self, path: &Path) -> String {
-        path.strip_prefix(&self.root).unwrap_or(path).display().to_string()
-    }
+/// A path as people type it: from the current folder, if it lies below.
+fn shown(path: &Path) -> String {
+    let here = std::env::current_dir().unwrap_or_default();
+    path.strip_prefix(here).unwrap_or(path).display().to_string()
 }
 
 fn show_stage(progress: &ProgressBar, stage: &str, done: usize, total: usize) {
@@ -198,9 +197,10 @@ mod tests {
     }
 
     #[test]
-    fn paths_of_the_tree_are_shown_from_its_root() {
+    fn paths_below_the_current_folder_are_short() {
         let bundle = Bundle::of_sources().unwrap();
-        assert_eq!(bundle.show(&bundle.frames("evaluation")), "host-sim/frames/evaluation");
-        assert_eq!(bundle.show(Path::new("/elsewhere/a")), "/elsewhere/a");
+        // Unit tests run in the folder of their crate.
+        assert_eq!(shown(&bundle.frames("evaluation")), "frames/evaluation");
+        assert_eq!(shown(Path::new("/elsewhere/a")), "/elsewhere/a");
     }
 }
