@@ -1,11 +1,11 @@
-//! The command line: `run` and `verify`.
+//! The command line: `run`, `verify`, `ablate`, and the demo without any of them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
 use crate::ablation;
 use crate::files::FrameSource;
 use crate::report::{VerifyReport, json, terminal};
-use crate::{run, verify};
+use crate::{demo, run, verify};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use model_compiler::cli::ImportArgs;
@@ -14,7 +14,12 @@ use std::ffi::OsString;
 use std::io::Write;
 use std::path::PathBuf;
 
-const EXAMPLES: &str = "Examples:
+const EXAMPLES: &str =
+    "Without a command: the demo. It compiles the bundled network (small and untrained), runs it, verifies every
+byte, and writes image, record and report.
+
+Examples:
+  host-sim
   host-sim run transfuser.img --frames frames/
   host-sim run transfuser.pth --inputs inputs.safetensors --json
   host-sim verify transfuser.img --model transfuser.pth --frames frames/ --mirror --min-sqnr 20
@@ -23,10 +28,15 @@ const EXAMPLES: &str = "Examples:
 
 /// Runs a driving network on the firmware's own engine, and proves that its numbers are right.
 #[derive(Debug, Parser)]
-#[command(version, about, after_help = EXAMPLES, arg_required_else_help = true)]
+#[command(version, about, after_help = EXAMPLES, args_conflicts_with_subcommands = true)]
 pub struct Cli {
     #[command(subcommand)]
-    command: Command,
+    command: Option<Command>,
+    /// Folder for the files of the demo [default: target/demo].
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    common: Common,
 }
 
 #[derive(Debug, Subcommand)]
@@ -115,11 +125,42 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
         Ok(cli) => cli,
         Err(error) => return usage(&error, arguments.iter().any(|argument| argument == "--json"), &mut console),
     };
-    let json = cli.command.common().json;
-    match cli.command.execute(&mut console) {
+    let json = cli.common().json;
+    match cli.execute(&mut console) {
         Ok(status) => status,
         Err(error) => fail(&error, json, &mut console),
     }
+}
+
+impl Cli {
+    fn common(&self) -> &Common {
+        self.command.as_ref().map_or(&self.common, Command::common)
+    }
+
+    fn execute(self, console: &mut Console<'_>) -> Result<u8> {
+        self.common().inject_fault()?;
+        let progress = progress_bar();
+        match self.command {
+            Some(command) => command.execute(console, &progress),
+            None => show(self.out, self.common.json, console, &progress),
+        }
+    }
+}
+
+/// The demo.
+fn show(out: Option<PathBuf>, json: bool, console: &mut Console<'_>, progress: &ProgressBar) -> Result<u8> {
+    let bundle = demo::Bundle::of_sources()?;
+    let out = out.unwrap_or_else(|| bundle.default_out());
+    let mut say = |text: &str| {
+        if !json {
+            progress.suspend(|| console.print(text));
+        }
+    };
+    let report = demo::demo(&bundle, &out, progress, &mut say)?;
+    if json {
+        console.print(&demo::document(&report).to_string());
+    }
+    Ok(conclude(&report, json, console))
 }
 
 impl Command {
@@ -129,12 +170,10 @@ impl Command {
         }
     }
 
-    fn execute(self, console: &mut Console<'_>) -> Result<u8> {
-        self.common().inject_fault()?;
-        let progress = progress_bar();
+    fn execute(self, console: &mut Console<'_>, progress: &ProgressBar) -> Result<u8> {
         match self {
             Self::Run { model, import, frames, common } => {
-                let report = run::run(&model, &import.options()?, &frames, &progress)?;
+                let report = run::run(&model, &import.options()?, &frames, progress)?;
                 progress.finish_and_clear();
                 console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(0)
@@ -142,14 +181,14 @@ impl Command {
             Self::Verify { image, model, import, frames, record, mirror, min_sqnr, common } => {
                 let import = import.options()?;
                 let options = verify::Options { image, record, model, import, frames, mirror, min_sqnr_db: min_sqnr };
-                let report = verify::verify(&options, &progress)?;
+                let report = verify::verify(&options, progress)?;
                 warn(&report, console);
                 console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
                 Ok(conclude(&report, common.json, console))
             }
             Self::Ablate { model, import, calib, frames, mirror, common } => {
                 let options = ablation::Options { model, import: import.options()?, calib, frames, mirror };
-                let rows = ablation::ablate(&options, &progress)?;
+                let rows = ablation::ablate(&options, progress)?;
                 console.print(&if common.json { json::ablation(&rows).to_string() } else { terminal::ablation(&rows) });
                 Ok(0)
             }
@@ -268,9 +307,18 @@ mod tests {
     }
 
     #[test]
+    fn the_demo_takes_no_command() {
+        let cli = Cli::try_parse_from(["host-sim"]).unwrap();
+        assert!(cli.command.is_none() && cli.out.is_none());
+        assert_eq!(parse("host-sim --out d --json").unwrap().out, Some("d".into()));
+        assert!(parse("host-sim --out d run a.img --frames f").is_err());
+        assert!(parse("host-sim fly").is_err());
+    }
+
+    #[test]
     fn verify_takes_its_options() {
         let cli = parse("host-sim verify a.img --model m.pth --frames f --mirror --min-sqnr 20.5 --record r").unwrap();
-        let Command::Verify { model, record, mirror, min_sqnr, .. } = cli.command else { panic!("not verify") };
+        let Some(Command::Verify { model, record, mirror, min_sqnr, .. }) = cli.command else { panic!("not verify") };
         assert_eq!((model, record), (Some("m.pth".into()), Some("r".into())));
         assert_eq!((mirror, min_sqnr), (true, Some(20.5)));
     }

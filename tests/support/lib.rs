@@ -1,6 +1,7 @@
 //! Support for the integration tests.
 
 pub mod build;
+pub mod bundle;
 pub mod golden;
 pub mod project;
 pub mod torch_file;
