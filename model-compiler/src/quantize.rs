@@ -28,6 +28,9 @@ pub use ranges::RangeRule;
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkipStages(Vec<u8>);
 
+/// ResNets have a stem and four stages.
+const LAST_STAGE: u8 = 4;
+
 impl SkipStages {
     /// All skip values in 8 bits.
     pub fn narrow() -> Self {
@@ -53,10 +56,12 @@ impl std::str::FromStr for SkipStages {
         match text {
             "i8" => Ok(Self::narrow()),
             "i16" => Ok(Self::wide()),
-            list => list.split(',').map(|s| s.trim().parse::<u8>()).collect::<std::result::Result<_, _>>().map_or_else(
-                |_| Err(format!("found {list:?}, expected i8, i16 or a list of 16-bit stages such as 0,1,2")),
-                |stages| Ok(Self(stages)),
-            ),
+            list => {
+                let stage = |s: &str| s.trim().parse::<u8>().ok().filter(|&stage| stage <= LAST_STAGE);
+                let stages: Option<Vec<u8>> = list.split(',').map(stage).collect();
+                let expected = "expected i8, i16 or a list of 16-bit stages 0..4 such as 0,1,2 (0 is the stem)";
+                stages.map(Self).ok_or_else(|| format!("found {list:?}, {expected}"))
+            }
         }
     }
 }

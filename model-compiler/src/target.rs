@@ -69,7 +69,7 @@ impl Target {
         }
         if Path::new(name).extension().is_none_or(|e| e != "toml") {
             let names: Vec<&str> = BUILT_IN.iter().map(|b| b.0).collect();
-            return Err(Error::new(ErrorCode::Usage, "target", format!("unknown target '{name}'"))
+            return Err(Error::new(ErrorCode::Usage, "--target", format!("unknown target '{name}'"))
                 .with_help(format!("use one of {}, or a file FILE.toml", names.join(", "))));
         }
         let text = std::fs::read_to_string(name).map_err(|e| Error::io(Path::new(name), &e))?;
