@@ -281,7 +281,8 @@ fn run_compile(
         quantize.quantized(model, bar)?
     };
     let options = target.plan_options(&target_data);
-    let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t))?;
+    let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t));
+    let compiled = compiled.map_err(|e| e.within(model.display()))?;
     pipeline::write(&compiled, output)?;
     let mut text = String::new();
     for (key, value) in pipeline::summary(&compiled) {

@@ -58,7 +58,7 @@ pub fn quantize_graph(
     let digests: Vec<String> = calibration.iter().map(Frame::short_digest).collect();
     model.provenance = vec![
         ("calibration_frames".into(), digests.join(",")),
-        ("skip_stages".into(), format!("{:?}", options.skip)),
+        ("skip_stages".into(), options.skip.to_string()),
         ("ranges".into(), format!("{:?}", options.ranges)),
         ("bias_correction".into(), options.bias_correction.to_string()),
         ("wide_stream".into(), options.wide_stream.to_string()),
