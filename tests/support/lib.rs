@@ -2,6 +2,7 @@
 
 pub mod build;
 pub mod bundle;
+pub mod commands;
 pub mod golden;
 pub mod project;
 pub mod torch_file;
