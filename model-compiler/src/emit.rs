@@ -2,6 +2,7 @@
 //! that is not named in [`firmware::image::layout`].
 
 use crate::error::{Error, ErrorCode, Result};
+use firmware::image::audit::audit;
 use firmware::image::layout::{self, header, region, section};
 use firmware::image::{Image, Port, SectionKind, TensorRecord, crc32};
 use firmware::program::{ConstRange, Step};
@@ -131,7 +132,7 @@ impl ConstantsBuilder {
     }
 }
 
-/// Writes an image and has the runtime's own parser and CRC check accept it.
+/// Writes an image and has the runtime's own parser, CRC check and audit accept it.
 ///
 /// # Errors
 /// `TooBig` or `Malformed` where a part does not fit the format; `Malformed` with the parser's words where the parts
@@ -141,6 +142,7 @@ pub fn emit(parts: &ImageParts) -> Result<Vec<u8>> {
     let aligned = AlignedBytes::from(bytes.as_slice());
     let image = Image::parse(&aligned).map_err(|error| malformed(&parts.name, error.to_string()))?;
     image.check().map_err(|error| malformed(&parts.name, error.to_string()))?;
+    audit(&image).map_err(|error| malformed(&parts.name, error.to_string()))?;
     Ok(bytes)
 }
 

@@ -24,7 +24,7 @@ pub fn path(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden").join(file)
 }
 
-/// Names and shapes of a system's checkpoint, in network order within each module and sorted by name overall.
+/// Names and shapes of a system's checkpoint, sorted by name.
 ///
 /// # Panics
 /// The system has no stored vectors.
