@@ -3,5 +3,8 @@
 pub mod build;
 pub mod every_step;
 pub mod golden;
+pub mod mutation;
 pub mod random;
+pub mod sketch;
 pub mod torch_file;
+pub mod trial;
