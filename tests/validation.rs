@@ -66,6 +66,51 @@ impl Tally {
     }
 }
 
+/// Fills of the constants per accepted image.
+const FILLS: usize = 10;
+
+#[test]
+fn accepted_images_run_with_any_constants() {
+    let _turn = turn();
+    let start = Instant::now();
+    println!("seed {SEED:#x}");
+    let mut bench = Bench::default();
+    let mut accepted = Vec::new();
+    mutation::visit_all(&every_step::parts(), &mut |what, image| {
+        let image = AlignedBytes::from(image);
+        if Image::parse(&image).is_ok() {
+            accepted.push((what.to_owned(), image));
+        }
+    });
+    let mut random = Random::new(SEED);
+    let mut tally = Tally::default();
+    for (what, image) in &mut accepted {
+        for fill in 0..FILLS {
+            fill_constants(image, &mut random);
+            let what = || format!("seed {SEED:#x}, {what}, fill {fill}");
+            tally.count(trial(&mut bench, image, &what), &what);
+        }
+    }
+    tally.print("any constants", start);
+    assert!(tally.refused.is_empty(), "parse does not read the constants: {tally:?}");
+    assert!(tally.ran > 1000 * FILLS, "{tally:?}");
+}
+
+/// Sets every word of the constants to an extreme or a random value; each fill prefers another extreme.
+fn fill_constants(image: &mut [u8], random: &mut Random) {
+    let slot = layout::header::SECTIONS.start + SectionKind::Constants as usize * layout::section::BYTES;
+    let word = |at: usize| u32::from_le_bytes([image[at], image[at + 1], image[at + 2], image[at + 3]]) as usize;
+    let (offset, length) = (word(slot + layout::section::OFFSET.start), word(slot + layout::section::LENGTH.start));
+    let extremes = [0, u32::MAX, 0x7FFF_FFFF, 0x8000_0000, 0x7FFF_7FFF, 0x8000_8000, 0x7F7F_7F7F, 0x8080_8080];
+    let preferred = *random.pick(&extremes);
+    for word in image[offset..offset + length].chunks_mut(4) {
+        let (extreme, any) = (*random.pick(&extremes), random.bits() as u32);
+        let value = *random.pick(&[preferred, preferred, extreme, any]);
+        word.copy_from_slice(&value.to_le_bytes()[..word.len()]);
+    }
+    reseal(image);
+}
+
 /// A trial in which a panic is the test's failure, with its cause named.
 fn trial(bench: &mut Bench, image: &[u8], what: &dyn Fn() -> String) -> Verdict {
     catch_unwind(AssertUnwindSafe(|| bench.trial(image))).unwrap_or_else(|_| panic!("{}: panicked", what()))

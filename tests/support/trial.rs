@@ -68,7 +68,12 @@ impl Bench {
 
     fn run(&mut self, image: Image<'_>) -> Verdict {
         let size = image.arena_bytes() as usize;
-        if image.work() > MAX_WORK || size > MAX_ARENA {
+        if size > MAX_ARENA {
+            let refused = Engine::new(image, Portable, &mut self.memory[self.start..self.start + MAX_ARENA]).err();
+            assert!(matches!(refused, Some(EngineError::ArenaTooSmall { .. })), "{refused:?}");
+            return Verdict::TooLarge;
+        }
+        if image.work() > MAX_WORK {
             return Verdict::TooLarge;
         }
         let end = self.start + size;
