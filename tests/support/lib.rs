@@ -3,6 +3,11 @@
 pub mod build;
 pub mod bundle;
 pub mod commands;
+pub mod every_step;
 pub mod golden;
+pub mod mutation;
 pub mod project;
+pub mod random;
+pub mod sketch;
 pub mod torch_file;
+pub mod trial;

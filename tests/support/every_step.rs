@@ -1,0 +1,292 @@
+//! The smallest network that uses every operator of the image format in every form: for suites that run it a million
+//! times. Two branches of 4 to 8 channels, one fusion by a transformer layer, the waypoint head.
+
+use crate::build;
+use crate::random::Random;
+use firmware::engine::Engine;
+use firmware::image::known_answer::Generator;
+use firmware::image::{Image, crc32};
+use firmware::kernels::Portable;
+use firmware::program::Window;
+use firmware::tensor::Shape;
+use model_compiler::emit::{AlignedBytes, ImageParts, KnownAnswer};
+use model_compiler::frames::{ByteMap, Frame};
+use model_compiler::ir::{
+    Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Tokens, ValueId, WaypointDecoder, Weights,
+};
+use model_compiler::pack::pack;
+use model_compiler::pipeline::{self, Compiled};
+use model_compiler::quantize::{QuantizeOptions, SkipStages};
+use std::sync::Arc;
+
+/// Seed of weights, frames and the known answer.
+pub const SEED: u64 = 2026;
+
+/// Channels of both branches and of the transformer.
+const CHANNELS: usize = 4;
+/// Height and width of both inputs.
+const SIZE: u16 = 16;
+
+/// Names of all operators, as [`firmware::program::Step::name`] gives them.
+pub const OPERATORS: [&str; 12] = [
+    "conv2d",
+    "linear",
+    "max_pool",
+    "average_pool",
+    "global_pool",
+    "add",
+    "requantize",
+    "resize_bilinear",
+    "tokens",
+    "layer_norm",
+    "attention",
+    "waypoint_decoder",
+];
+
+/// The float network.
+///
+/// # Panics
+/// Never: the operators fit together.
+pub fn graph() -> Graph {
+    let mut b = Builder { graph: Graph { name: "every step".into(), ..Default::default() }, random: Random::new(SEED) };
+    let rgb = b.graph.push_input("rgb", InputKind::Image, Shape::map(SIZE, SIZE, 3));
+    let bev = b.graph.push_input("bev", InputKind::Bev, Shape::map(SIZE, SIZE, 2));
+    let velocity = b.graph.push_input("velocity", InputKind::Velocity, Shape::vector(1));
+    let goal = b.graph.push_input("goal", InputKind::Goal, Shape::vector(2));
+    let image = b.image_branch(rgb);
+    let stem = b.conv("lidar.stem", &[bev], window(3, 2, 1), 1, None, true);
+    let lidar = b.push("lidar.pool", Op::AveragePool(window(2, 2, 0)), &[stem]);
+    let [image_tokens, lidar_tokens] = b.transformer(image, lidar, velocity);
+    let enlarged = Op::ResizeBilinear { factor: (2, 2) };
+    let image = b.push("image.fused", enlarged.clone(), &[image_tokens, image]);
+    let lidar_tokens = b.push("lidar.enlarged", enlarged, &[lidar_tokens]);
+    let lidar = b.push("lidar.fused", Op::Add { relu: true }, &[lidar, lidar_tokens]);
+    let features = b.push("features", Op::GlobalPool, &[image, lidar]);
+    let joined = b.linear("join.0", &[features], 6, true);
+    let hidden = b.linear("join.2", &[joined], CHANNELS, false);
+    let decoder = b.decoder();
+    let waypoints = b.push("waypoints", decoder, &[hidden, goal]);
+    b.graph.outputs.push(waypoints);
+    b.graph
+}
+
+/// A few random frames of the network's size.
+pub fn frames(seed: u64, count: usize) -> Vec<Frame> {
+    let mut random = Random::new(seed);
+    let mut map = |channels: u16, values: usize| {
+        let shape = Shape::map(SIZE, SIZE, channels);
+        let data = (0..shape.elements()).map(|_| random.below(values) as u8).collect();
+        Some(ByteMap { shape, data })
+    };
+    let frame = |i: usize| Frame {
+        name: format!("random {i} of seed {seed}"),
+        rgb: map(3, 256),
+        bev: map(2, 6),
+        velocity: Some(1.5 * i as f64),
+        goal: Some([2.0 - i as f64, -8.0 - 3.0 * i as f64]),
+        command: None,
+        dropped_points: 0,
+    };
+    (0..count).map(frame).collect()
+}
+
+/// The network quantized with wide skips and compiled for the portable target.
+///
+/// # Panics
+/// The compiler refuses it, or an operator or one of its forms is missing in the program.
+pub fn compiled() -> Compiled {
+    let options = QuantizeOptions { skip: SkipStages::wide(), ..Default::default() };
+    let model = pipeline::quantize_graph(&graph(), &frames(SEED, 4), &options, &mut |_, _, _| {});
+    build::compiled(&model.unwrap_or_else(|e| panic!("{e}")))
+}
+
+/// What the image is made of, with its known answer: for tests that assemble it in another way.
+///
+/// # Panics
+/// As [`compiled`].
+pub fn parts() -> ImageParts {
+    let compiled = compiled();
+    let mut parts = pack(&compiled.record.model, &compiled.record.plan).unwrap_or_else(|e| panic!("{e}"));
+    parts.known_answer = Some(known_answer(&compiled.image, SEED));
+    parts
+}
+
+/// What the portable engine gives for the seeded inputs of an image.
+///
+/// # Panics
+/// The image is refused.
+pub fn known_answer(image: &[u8], seed: u64) -> KnownAnswer {
+    let image = AlignedBytes::from(image);
+    let image = Image::parse(&image).unwrap_or_else(|e| panic!("{e}"));
+    let mut generator = Generator::new(seed);
+    let inputs = (0..image.input_count()).filter_map(|i| image.tensor(image.input(i)?.tensor)).map(|record| {
+        let mut bytes = vec![0; record.bytes as usize];
+        generator.fill(record.element, &mut bytes);
+        bytes
+    });
+    let inputs: Vec<Vec<u8>> = inputs.collect();
+    let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
+    let mut arena = AlignedBytes::zeroed(image.arena_bytes() as usize);
+    let mut step_crcs = Vec::new();
+    let mut engine = Engine::new(image, Portable, &mut arena).unwrap_or_else(|e| panic!("{e}"));
+    engine.infer_observed(&inputs, |_, _, bytes| step_crcs.push(crc32(bytes))).unwrap_or_else(|e| panic!("{e}"));
+    KnownAnswer { seed, step_crcs }
+}
+
+struct Builder {
+    graph: Graph,
+    random: Random,
+}
+
+impl Builder {
+    fn push(&mut self, name: &str, op: Op, inputs: &[ValueId]) -> ValueId {
+        self.graph.push(name, op, inputs).unwrap_or_else(|e| panic!("{name}: {e}"))
+    }
+
+    fn values(&mut self, count: usize, amplitude: f32) -> Vec<f32> {
+        (0..count).map(|_| amplitude * self.random.signed_unit()).collect()
+    }
+
+    /// Weights that keep the magnitude of their input.
+    fn weights(&mut self, shape: &[usize]) -> Arc<Weights> {
+        let count = shape.iter().product();
+        let depth = count / shape[0];
+        let data = self.values(count, (3.0 / depth as f32).sqrt());
+        Arc::new(Weights { shape: shape.to_vec(), data })
+    }
+
+    fn bias(&mut self, count: usize) -> Arc<Vec<f32>> {
+        Arc::new(self.values(count, 0.2))
+    }
+
+    fn channels(&self, value: ValueId) -> usize {
+        self.graph.value(value).shape.channels.into()
+    }
+
+    fn conv(
+        &mut self,
+        name: &str,
+        inputs: &[ValueId],
+        window: Window,
+        groups: u16,
+        normalization: Option<Normalization>,
+        relu: bool,
+    ) -> ValueId {
+        let depth = self.channels(inputs[0]) / usize::from(groups);
+        let conv = Conv2d {
+            weights: self.weights(&[CHANNELS, window.kernel_h.into(), window.kernel_w.into(), depth]),
+            bias: Some(self.bias(CHANNELS)),
+            window,
+            groups,
+            normalization: normalization.map(Arc::new),
+            relu,
+        };
+        self.push(name, Op::Conv2d(conv), inputs)
+    }
+
+    fn linear(&mut self, name: &str, inputs: &[ValueId], outputs: usize, relu: bool) -> ValueId {
+        let depth = self.channels(inputs[0]);
+        let linear = Linear { weights: self.weights(&[outputs, depth]), bias: Some(self.bias(outputs)), relu };
+        self.push(name, Op::Linear(linear), inputs)
+    }
+
+    fn layer_norm(&mut self, name: &str, input: ValueId, first_row: u16, grid: (u16, u16)) -> ValueId {
+        let weight = Arc::new(self.values(CHANNELS, 0.3).into_iter().map(|v| 1.0 + v).collect());
+        let norm = LayerNorm { weight, bias: self.bias(CHANNELS), epsilon: 1e-5, first_row, grid };
+        self.push(name, Op::LayerNorm(norm), &[input])
+    }
+
+    /// Strided stem, padded max pool, a residual block with a grouped convolution.
+    fn image_branch(&mut self, rgb: ValueId) -> ValueId {
+        let normalization = Normalization { mean: vec![124.0, 116.0, 104.0], std: vec![58.0, 57.0, 57.5] };
+        let stem = self.conv("image.stem", &[rgb], window(3, 2, 1), 1, Some(normalization), false);
+        let pooled = self.push("image.pool", Op::MaxPool(window(3, 2, 1)), &[stem]);
+        let grouped = self.conv("image.conv1", &[pooled], window(3, 1, 1), 2, None, true);
+        self.conv("image.conv2", &[grouped, pooled], window(3, 1, 1), 1, None, true)
+    }
+
+    /// One layer over four tokens of each branch; returns the normalized maps of both.
+    fn transformer(&mut self, image: ValueId, lidar: ValueId, velocity: ValueId) -> [ValueId; 2] {
+        let tokens = Tokens {
+            grid: (2, 2),
+            position: Some(self.weights(&[8, CHANNELS])),
+            velocity_weights: Arc::new(self.values(CHANNELS, 0.1)),
+            velocity_bias: self.bias(CHANNELS),
+        };
+        let x = self.push("tokens", Op::Tokens(tokens), &[image, lidar, velocity]);
+        let normed = self.layer_norm("ln1", x, 0, (8, 1));
+        let heads = ["query", "key", "value"].map(|name| self.linear(name, &[normed], CHANNELS, false));
+        let context = self.push("attention", Op::Attention { heads: 2 }, &heads);
+        let x = self.linear("proj", &[context, x], CHANNELS, false);
+        let normed = self.layer_norm("ln2", x, 0, (8, 1));
+        let mlp = self.linear("mlp.0", &[normed], 8, true);
+        let x = self.linear("mlp.2", &[mlp, x], CHANNELS, false);
+        [("ln_f.image", 0), ("ln_f.lidar", 4)].map(|(name, first_row)| self.layer_norm(name, x, first_row, (2, 2)))
+    }
+
+    fn decoder(&mut self) -> Op {
+        Op::WaypointDecoder(WaypointDecoder {
+            input_weights: self.weights(&[3 * CHANNELS, 2]),
+            hidden_weights: self.weights(&[3 * CHANNELS, CHANNELS]),
+            input_bias: self.bias(3 * CHANNELS),
+            hidden_bias: self.bias(3 * CHANNELS),
+            output_weights: self.weights(&[2, CHANNELS]),
+            output_bias: self.bias(2),
+            steps: 4,
+        })
+    }
+}
+
+fn window(kernel: u8, stride: u8, pad: u8) -> Window {
+    Window {
+        kernel_h: kernel,
+        kernel_w: kernel,
+        stride_h: stride,
+        stride_w: stride,
+        pad_top: pad,
+        pad_bottom: pad,
+        pad_left: pad,
+        pad_right: pad,
+        dilation_h: 1,
+        dilation_w: 1,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use firmware::program::{Residual, Step};
+    use model_compiler::emit::emit;
+
+    #[test]
+    fn every_operator_occurs_in_every_form() {
+        let parts = parts();
+        let forms = |matches: &dyn Fn(&Step) -> bool| parts.steps.iter().any(matches);
+        for name in OPERATORS {
+            assert!(forms(&|step| step.name() == name), "{name}");
+        }
+        let scaled = |residual: &Residual| matches!(residual, Residual::Scaled { .. });
+        assert!(forms(&|s| matches!(s, Step::Conv2d(s) if s.groups > 1)));
+        assert!(forms(&|s| matches!(s, Step::Conv2d(s) if s.window.stride_h > 1)));
+        assert!(forms(&|s| matches!(s, Step::Conv2d(s) if s.rescale.residual == Residual::None)));
+        assert!(forms(&|s| matches!(s, Step::Conv2d(s) if scaled(&s.rescale.residual))));
+        assert!(forms(&|s| matches!(s, Step::Linear(s) if s.rescale.residual == Residual::None)));
+        assert!(forms(&|s| matches!(s, Step::Linear(s) if matches!(s.rescale.residual, Residual::Stream { .. }))));
+        assert!(forms(&|s| matches!(s, Step::Linear(s) if s.scratch.is_none())), "16-bit input");
+        assert!(forms(&|s| matches!(s, Step::GlobalPool(s) if s.second.is_some())));
+        assert!(forms(&|s| matches!(s, Step::ResizeBilinear(s) if s.residual.is_some())));
+        assert!(forms(&|s| matches!(s, Step::ResizeBilinear(s) if s.residual.is_none())));
+        assert!(forms(&|s| matches!(s, Step::LayerNorm(s) if s.first_row > 0)));
+        let in_place = parts.tensors.iter().filter(|tensor| tensor.in_place_of.is_some()).count();
+        assert!(in_place >= 3, "{in_place} tensors in place");
+    }
+
+    #[test]
+    fn the_image_passes_its_self_test() {
+        let bytes = AlignedBytes::from(emit(&parts()).unwrap().as_slice());
+        let image = Image::parse(&bytes).unwrap();
+        let mut arena = AlignedBytes::zeroed(image.arena_bytes() as usize);
+        Engine::new(image, Portable, &mut arena).unwrap().self_test().unwrap();
+        println!("{} steps, {} bytes, {} operations", image.step_count(), bytes.len(), image.work());
+    }
+}
