@@ -20,7 +20,8 @@ use crate::image::{Image, Port, TensorRecord, known_answer};
 use crate::kernels::Kernels;
 use crate::ops;
 use crate::program::{KernelId, Step};
-use crate::tensor::index;
+use crate::tensor::{ElementType, index};
+use crate::waypoint::{self, MAX_WAYPOINTS, Waypoint};
 use core::fmt;
 
 /// Why the engine refuses.
@@ -65,6 +66,8 @@ pub enum EngineError {
     NotDone,
     /// The network has no output of this index.
     NoSuchOutput(u32),
+    /// This output does not hold waypoints.
+    NoWaypoints(u8),
     /// The image has no known answer.
     NoKnownAnswer,
     /// A step of the known answer gave other bytes.
@@ -98,6 +101,7 @@ impl fmt::Display for EngineError {
             Self::NotStarted => write!(f, "no inference was started"),
             Self::NotDone => write!(f, "the inference is not done"),
             Self::NoSuchOutput(index) => write!(f, "the network has no output {index}"),
+            Self::NoWaypoints(output) => write!(f, "output {output} does not hold waypoints"),
             Self::NoKnownAnswer => write!(f, "the image holds no known answer"),
             Self::WrongAnswer { step, found, expected } => {
                 write!(f, "step {step}: self-test gave CRC {found:08x}, expected {expected:08x}")
@@ -234,6 +238,18 @@ impl<'a, K: Kernels> Engine<'a, K> {
         let port = self.image.output(number).ok_or(changed)?;
         let record = self.image.tensor(port.tensor).ok_or(changed)?;
         self.arena.get(span(&record)).ok_or(changed)
+    }
+
+    /// The waypoints of an output, after [`Progress::Done`].
+    ///
+    /// # Errors
+    /// As [`Self::output`]; [`EngineError::NoWaypoints`] where the output holds something else.
+    pub fn waypoints(&self, output: usize) -> Result<heapless::Vec<Waypoint, MAX_WAYPOINTS>, EngineError> {
+        let bytes = self.output(output)?;
+        let number = u8::try_from(output).unwrap_or(u8::MAX);
+        let record = self.image.output(number).and_then(|port| self.image.tensor(port.tensor));
+        let is_points = record.is_some_and(|r| r.element == ElementType::I32 && r.shape.channels == 2);
+        waypoint::read(bytes).filter(|_| is_points).ok_or(EngineError::NoWaypoints(number))
     }
 
     /// The arena, for tests of the memory plan (poison in dead bytes must not change any output). Whatever is written

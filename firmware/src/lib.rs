@@ -7,16 +7,16 @@
 //! use firmware::engine::{Engine, EngineError, Progress};
 //! use firmware::image::Image;
 //! use firmware::kernels::Portable;
+//! use firmware::waypoint::Waypoint;
 //!
-//! /// Waypoints (Q16 meters, little-endian) of one frame.
-//! fn infer(image: Image, arena: &mut [u8], frame: &[&[u8]], waypoints: &mut [u8; 32]) -> Result<(), EngineError> {
+//! /// The first waypoint of one frame.
+//! fn drive(image: Image, arena: &mut [u8], frame: &[&[u8]]) -> Result<Option<Waypoint>, EngineError> {
 //!     let mut engine = Engine::new(image, Portable, arena)?;
 //!     engine.start(frame)?;
 //!     while engine.step()? != Progress::Done {
 //!         // feed the watchdog, yield, or abandon the frame
 //!     }
-//!     waypoints.copy_from_slice(engine.output(0)?);
-//!     Ok(())
+//!     Ok(engine.waypoints(0)?.first().copied())
 //! }
 //!
 //! let refused = Image::parse(&[0; 100]).unwrap_err();
@@ -31,6 +31,7 @@
 //! * [`kernels`]: one method per operator; [`kernels::portable`] is the norm, other backends equal it byte for byte.
 //!   [`kernels::plan`] tells compiler and runtime what a kernel needs.
 //! * [`image`] and [`program`]: the file format, its checks, and the steps. The compiler writes what these define.
+//! * [`waypoint`]: the network's result as a controller reads it.
 //! * [`tensor`] and [`fixed_point`]: shapes, types and the one arithmetic.
 //!
 //! # Promises
@@ -62,3 +63,4 @@ pub mod kernels;
 pub mod ops;
 pub mod program;
 pub mod tensor;
+pub mod waypoint;
