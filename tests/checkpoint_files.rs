@@ -205,6 +205,10 @@ fn entries_that_are_no_tensors_are_listed() {
         Py::dict([("a", Py::tensor(storage, 0, &[1], &[1])), ("epoch", Py::Int(3)), ("note", Py::str("x"))])
     });
     assert_eq!(parse(&saved.zip()).unwrap().skipped(), ["epoch", "note"]);
+    let wrapped = saved.wrap(|weights| {
+        Py::Dict(vec![(Py::str("lr"), Py::Float(0.1)), (Py::str("net"), weights), (Py::Int(0), Py::None)])
+    });
+    assert_eq!(parse(&wrapped.legacy()).unwrap().skipped(), ["lr", "(an int as a name)", "epoch", "note"]);
 }
 
 #[test]
@@ -362,6 +366,15 @@ fn views_outside_their_storage_are_refused() {
     assert_error(&view(0, &[2], &[-1]).zip(), ErrorCode::Malformed, &["found the number -1", "none below zero"]);
     assert_error(&view(0, &[2], &[1, 1]).zip(), ErrorCode::Malformed, &["found 1 extents and 2 strides"]);
     assert_error(&view(0, &[1; 33], &[1; 33]).zip(), ErrorCode::Malformed, &["length 33, expected at most 32"]);
+}
+
+/// A long name costs two bytes where the memo recalls it; as many copies of it would be a bomb.
+#[test]
+fn recalled_names_are_not_copied() {
+    let name = [b"X\x00\x00\x10\x00".as_slice(), &vec![b'a'; 1 << 20], b"q\x01"].concat();
+    let items = [b"}(".to_vec(), name, b"K\x00".to_vec(), b"h\x01K\x00".repeat(1 << 18), b"u".to_vec()].concat();
+    let saved = Saved { root: Py::Raw(items), storages: vec![] };
+    assert_error(&saved.legacy(), ErrorCode::Malformed, &["found twice"]);
 }
 
 #[test]

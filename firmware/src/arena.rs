@@ -137,6 +137,7 @@ fn cast_mut<T: Pod>(bytes: &mut [u8]) -> Result<&mut [T], Changed> {
 }
 
 #[cfg(test)]
+#[allow(clippy::expect_used, reason = "a failed expectation is a failed test")]
 mod tests {
     use super::*;
 

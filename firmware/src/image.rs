@@ -1,4 +1,52 @@
-//! The model image.
+//! The model image: one little-endian file, executed in place, every byte of it covered by a check.
+//!
+//! # The format
+//!
+//! The base address is a multiple of 16. Fixed records, 32-bit offsets, no pointers, no compression. Field positions are
+//! the constants of [`layout`], which the compiler's writer uses too.
+//!
+//! | part | content | covered by |
+//! |---|---|---|
+//! | header, 384 bytes | magic, format, counts, features, name, digests, regions, section table | header CRC |
+//! | ports | inputs, then outputs: tensor, zero point, scale (metadata), name; 32 bytes each | section CRC |
+//! | tensors | 32-byte records `{region, type, offset, bytes, dims, first_step, last_step, in_place_of}` | section CRC |
+//! | step index | first byte of every step in the program, `u32` each | section CRC |
+//! | program | the steps, [postcard](https://docs.rs/postcard) of [`crate::program::Step`] | section CRC |
+//! | constants | weights, biases, multipliers, tables; ranges start at multiples of 16 | section CRC |
+//! | known answer | optional: a seed and the CRC of every step's output ([`known_answer`]) | section CRC |
+//!
+//! Sections follow each other without gaps, each padded with zeros to a multiple of 16. A section's CRC covers its
+//! padding and is stored in the section table; the header CRC covers the table; reserved bytes are zero; the file is as
+//! long as the header says. CRCs are CRC-32/ISO-HDLC.
+//!
+//! A tensor record is also the live range: `first_step` writes the tensor (0 for inputs), `last_step` reads it for the
+//! last time (the program's last step for outputs). Scratch is a record of type `Scratch` with no shape that one step
+//! uses. `in_place_of` names the operand whose memory the writing step takes over.
+//!
+//! # What each level proves
+//!
+//! | level | reads | proves |
+//! |---|---|---|
+//! | [`Image::parse`] | header, tables, program | no access out of bounds, no panic, bounded work, live tensors never overwritten |
+//! | [`Image::check`] ([`Checker`] in slices) | every byte | the bytes are those that were written |
+//! | [`crate::engine::Engine::self_test`] | constants | this machine computes what the compiler's did |
+//! | [`audit::audit`] | constants | no accumulator overflows; multipliers, shifts and tables are in their ranges |
+//!
+//! `parse` proves nothing about the *values* of constants: damaged weights give wrong numbers, not a fault. CRCs are no
+//! protection against intent; for that sign the file and check the signature before `parse`.
+//!
+//! # An image byte by byte
+//!
+//! One step, `y = R(q·2^23, 23)` over 16 codes (a copy):
+//!
+//! ```text
+#![doc = include_str!("image/example.hex")]
+//! ```
+//!
+//! At 0 magic, format 1, 1 step, length; at 0x10 features: bit 6 (requantize); at 0x18 2 tensors, 1 input, 1 output, 1
+//! region. At 0x80 the region `main`: 32 bytes, aligned to 16. At 0xC0 the section table `(kind, offset, length, CRC)`.
+//! At 0x17C the header CRC. At 0x180 the two ports, at 0x1C0 the two tensor records, at 0x200 the step index, at 0x210
+//! the step: variant 6, input 0, output 1, zero point 0, multiplier and shift, zero point 0, bounds −128..127.
 #![deny(
     clippy::indexing_slicing,
     clippy::arithmetic_side_effects,
@@ -99,6 +147,13 @@ impl<'a> Image<'a> {
     /// The first check of [`Check`] that fails.
     pub fn parse(bytes: &'a [u8]) -> Result<Self, ParseError> {
         parse::parse(bytes)
+    }
+
+    /// The same proof over other bytes: what the engine sees if the memory of an image changes after `parse`. For
+    /// tests.
+    #[cfg(feature = "fault-injection")]
+    pub fn changed_to<'b>(&self, bytes: &'b [u8]) -> Image<'b> {
+        Image { bytes, ..*self }
     }
 
     /// The whole file.

@@ -1,4 +1,52 @@
 //! Runtime for quantized driving networks: `no_std`, no heap, no float, no panic after validation.
+//!
+//! A network arrives as a *model image*, written by the compiler and executed in place. The runtime proves once that
+//! the image cannot lead it astray, and then runs it step by step in a buffer that the caller owns:
+//!
+//! ```
+//! use firmware::engine::{Engine, EngineError, Progress};
+//! use firmware::image::Image;
+//! use firmware::kernels::Portable;
+//!
+//! /// Waypoints (Q16 meters, little-endian) of one frame.
+//! fn infer(image: Image, arena: &mut [u8], frame: &[&[u8]], waypoints: &mut [u8; 32]) -> Result<(), EngineError> {
+//!     let mut engine = Engine::new(image, Portable, arena)?;
+//!     engine.start(frame)?;
+//!     while engine.step()? != Progress::Done {
+//!         // feed the watchdog, yield, or abandon the frame
+//!     }
+//!     waypoints.copy_from_slice(engine.output(0)?);
+//!     Ok(())
+//! }
+//!
+//! let refused = Image::parse(&[0; 100]).unwrap_err();
+//! println!("{refused}"); // what is wrong, where, found, expected
+//! ```
+//!
+//! # Layers, top first
+//!
+//! * [`engine`]: `start`, `step`, `infer`, self-test. Owns nothing but a position.
+//! * [`ops`]: one operator per file: what its step must satisfy, and how it becomes a call of a kernel.
+//! * [`arena`]: the operands of a step as disjoint slices of one buffer, by checked means only.
+//! * [`kernels`]: one method per operator; [`kernels::portable`] is the norm, other backends equal it byte for byte.
+//!   [`kernels::plan`] tells compiler and runtime what a kernel needs.
+//! * [`image`] and [`program`]: the file format, its checks, and the steps. The compiler writes what these define.
+//! * [`tensor`] and [`fixed_point`]: shapes, types and the one arithmetic.
+//!
+//! # Promises
+//!
+//! 1. After [`image::Image::parse`] accepted an image, nothing here panics, allocates, loops without bound or touches
+//!    memory outside the arena, whatever the constants hold. The work of one inference is known
+//!    ([`image::Image::work`]).
+//! 2. An operator never sees overlapping operands: slices are cut at run time by `get_disjoint_mut`, independently of
+//!    what `parse` proved. There is no `unsafe` outside kernel backends, and none relies on `parse`.
+//! 3. If the image's memory changes after `parse`, `step` answers [`engine::EngineError::ImageChanged`] or computes
+//!    wrong numbers. [`image::Checker`] finds such a change, a slice of bytes at a time.
+//! 4. Equal image and inputs give equal bytes on every backend and machine: the arithmetic is integers with one
+//!    rounding rule.
+//!
+//! What is *not* promised: that the numbers are good (the host compares them with the float model), that an image is
+//! authentic (a CRC is not a signature), and any bound on time other than the number of operations.
 #![no_std]
 #![deny(unsafe_code)]
 

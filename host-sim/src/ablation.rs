@@ -2,9 +2,12 @@
 //!
 //! The f64 model stands for the engine, since their bytes are equal; nothing has to be compiled.
 
+use crate::files::FrameSource;
+use indicatif::ProgressBar;
 use model_compiler::calibrate::{Statistics, calibrate};
 use model_compiler::error::{Error, ErrorCode, Result};
-use model_compiler::frames::Frame;
+use model_compiler::frames::{Frame, FrameFormat};
+use model_compiler::import::ImportOptions;
 use model_compiler::integer_reference;
 use model_compiler::ir::{Graph, Op};
 use model_compiler::passes::PassOptions;
@@ -12,6 +15,8 @@ use model_compiler::pipeline;
 use model_compiler::qmodel::QModel;
 use model_compiler::quantize::{QuantizeOptions, RangeRule, SkipStages, quantize};
 use model_compiler::reference;
+use serde::Serialize;
+use std::path::PathBuf;
 
 /// One way to quantize.
 #[derive(Clone, Debug, PartialEq)]
@@ -25,7 +30,7 @@ pub struct Variant {
 }
 
 /// What a variant reaches over all evaluation frames.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fidelity {
     /// SQNR of the pooled global vector, dB: power sums over all frames.
     pub vector_sqnr_db: f64,
@@ -53,6 +58,60 @@ pub fn variants() -> Vec<Variant> {
         variant("without MSE ranges", QuantizeOptions { ranges: RangeRule::MinMax, ..base.clone() }),
         variant("without bias correction", QuantizeOptions { bias_correction: false, ..base }),
     ]
+}
+
+/// One line of the comparison.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Row {
+    /// What is different.
+    pub variant: &'static str,
+    /// What it reaches.
+    pub fidelity: Fidelity,
+}
+
+/// What to compare.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Checkpoint.
+    pub model: PathBuf,
+    /// How it is read.
+    pub import: ImportOptions,
+    /// Calibration frames.
+    pub calib: PathBuf,
+    /// Evaluation frames.
+    pub frames: FrameSource,
+    /// Also evaluate on the mirror image of every frame.
+    pub mirror: bool,
+}
+
+/// Measures every variant on a checkpoint.
+///
+/// # Errors
+/// A file cannot be read, or a variant is refused by the quantizer.
+pub fn ablate(options: &Options, progress: &ProgressBar) -> Result<Vec<Row>> {
+    let variants = variants();
+    let graph = |passes| pipeline::load_graph(&options.model, &options.import, &passes);
+    let fused = graph(PassOptions::default())?;
+    let calibration = pipeline::load_frames(&fused, &options.calib)?;
+    let mut evaluation = options.frames.load(&FrameFormat::of_graph(&fused))?;
+    if options.mirror {
+        evaluation.extend(evaluation.iter().map(Frame::mirrored).collect::<Vec<_>>());
+    }
+    progress.set_length((variants.len() * evaluation.len()) as u64);
+    let mut bench = Bench::new(fused, &calibration, &evaluation)?;
+    let mut passes = PassOptions::default();
+    let mut rows = Vec::new();
+    for variant in variants {
+        progress.set_message(variant.name);
+        if variant.passes != passes {
+            passes = variant.passes;
+            bench = Bench::new(graph(passes)?, &calibration, &evaluation)?;
+        }
+        let fidelity = bench.measure(&variant.quantize, |_| progress.inc(1))?;
+        rows.push(Row { variant: variant.name, fidelity });
+    }
+    progress.finish_and_clear();
+    Ok(rows)
 }
 
 /// A graph with its statistics and what f32 gives for the evaluation frames.

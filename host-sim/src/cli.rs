@@ -1,10 +1,11 @@
-//! The command line: `run` and `verify`.
+//! The command line: `run`, `verify`, `ablate`, and the demo without any of them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
+use crate::ablation;
 use crate::files::FrameSource;
 use crate::report::{VerifyReport, json, terminal};
-use crate::{run, verify};
+use crate::{demo, run, verify};
 use clap::{Args, Parser, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use model_compiler::cli::ImportArgs;
@@ -13,18 +14,29 @@ use std::ffi::OsString;
 use std::io::Write;
 use std::path::PathBuf;
 
-const EXAMPLES: &str = "Examples:
+const EXAMPLES: &str =
+    "Without a command: the demo. It compiles the bundled network (small and untrained), runs it, verifies every
+byte, and writes image, record and report.
+
+Examples:
+  host-sim
   host-sim run transfuser.img --frames frames/
   host-sim run transfuser.pth --inputs inputs.safetensors --json
   host-sim verify transfuser.img --model transfuser.pth --frames frames/ --mirror --min-sqnr 20
-  host-sim verify transfuser.img --inputs inputs.safetensors";
+  host-sim verify transfuser.img --inputs inputs.safetensors
+  host-sim ablate transfuser.pth --calib frames/ --frames drive/";
 
 /// Runs a driving network on the firmware's own engine, and proves that its numbers are right.
 #[derive(Debug, Parser)]
-#[command(version, about, after_help = EXAMPLES, arg_required_else_help = true)]
+#[command(version, about, after_help = EXAMPLES, args_conflicts_with_subcommands = true)]
 pub struct Cli {
     #[command(subcommand)]
-    command: Command,
+    command: Option<Command>,
+    /// Folder for the files of the demo [default: target/demo].
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    #[command(flatten)]
+    common: Common,
 }
 
 #[derive(Debug, Subcommand)]
@@ -67,6 +79,24 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
+    /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, waypoint error.
+    #[command(after_help = EXAMPLES)]
+    Ablate {
+        /// Checkpoint.
+        model: PathBuf,
+        #[command(flatten)]
+        import: ImportArgs,
+        /// Calibration frames: a frame directory or a .safetensors file of raw inputs.
+        #[arg(long, value_name = "FRAMES|FILE")]
+        calib: PathBuf,
+        #[command(flatten)]
+        frames: FrameSource,
+        /// Also evaluate on the mirror image of every frame.
+        #[arg(long)]
+        mirror: bool,
+        #[command(flatten)]
+        common: Common,
+    },
 }
 
 #[derive(Debug, Args)]
@@ -95,26 +125,55 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
         Ok(cli) => cli,
         Err(error) => return usage(&error, arguments.iter().any(|argument| argument == "--json"), &mut console),
     };
-    let json = cli.command.common().json;
-    match cli.command.execute(&mut console) {
+    let json = cli.common().json;
+    match cli.execute(&mut console) {
         Ok(status) => status,
         Err(error) => fail(&error, json, &mut console),
     }
 }
 
-impl Command {
+impl Cli {
     fn common(&self) -> &Common {
-        match self {
-            Self::Run { common, .. } | Self::Verify { common, .. } => common,
-        }
+        self.command.as_ref().map_or(&self.common, Command::common)
     }
 
     fn execute(self, console: &mut Console<'_>) -> Result<u8> {
         self.common().inject_fault()?;
         let progress = progress_bar();
+        match self.command {
+            Some(command) => command.execute(console, &progress),
+            None => show(self.out, self.common.json, console, &progress),
+        }
+    }
+}
+
+/// The demo.
+fn show(out: Option<PathBuf>, json: bool, console: &mut Console<'_>, progress: &ProgressBar) -> Result<u8> {
+    let bundle = demo::Bundle::of_sources()?;
+    let out = out.unwrap_or_else(|| bundle.default_out());
+    let mut say = |text: &str| {
+        if !json {
+            progress.suspend(|| console.print(text));
+        }
+    };
+    let report = demo::demo(&bundle, &out, progress, &mut say)?;
+    if json {
+        console.print(&demo::document(&report).to_string());
+    }
+    Ok(conclude(&report, json, console))
+}
+
+impl Command {
+    fn common(&self) -> &Common {
+        match self {
+            Self::Run { common, .. } | Self::Verify { common, .. } | Self::Ablate { common, .. } => common,
+        }
+    }
+
+    fn execute(self, console: &mut Console<'_>, progress: &ProgressBar) -> Result<u8> {
         match self {
             Self::Run { model, import, frames, common } => {
-                let report = run::run(&model, &import.options()?, &frames, &progress)?;
+                let report = run::run(&model, &import.options()?, &frames, progress)?;
                 progress.finish_and_clear();
                 console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(0)
@@ -122,10 +181,16 @@ impl Command {
             Self::Verify { image, model, import, frames, record, mirror, min_sqnr, common } => {
                 let import = import.options()?;
                 let options = verify::Options { image, record, model, import, frames, mirror, min_sqnr_db: min_sqnr };
-                let report = verify::verify(&options, &progress)?;
+                let report = verify::verify(&options, progress)?;
                 warn(&report, console);
                 console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
                 Ok(conclude(&report, common.json, console))
+            }
+            Self::Ablate { model, import, calib, frames, mirror, common } => {
+                let options = ablation::Options { model, import: import.options()?, calib, frames, mirror };
+                let rows = ablation::ablate(&options, progress)?;
+                console.print(&if common.json { json::ablation(&rows).to_string() } else { terminal::ablation(&rows) });
+                Ok(0)
             }
         }
     }
@@ -242,9 +307,18 @@ mod tests {
     }
 
     #[test]
+    fn the_demo_takes_no_command() {
+        let cli = Cli::try_parse_from(["host-sim"]).unwrap();
+        assert!(cli.command.is_none() && cli.out.is_none());
+        assert_eq!(parse("host-sim --out d --json").unwrap().out, Some("d".into()));
+        assert!(parse("host-sim --out d run a.img --frames f").is_err());
+        assert!(parse("host-sim fly").is_err());
+    }
+
+    #[test]
     fn verify_takes_its_options() {
         let cli = parse("host-sim verify a.img --model m.pth --frames f --mirror --min-sqnr 20.5 --record r").unwrap();
-        let Command::Verify { model, record, mirror, min_sqnr, .. } = cli.command else { panic!("not verify") };
+        let Some(Command::Verify { model, record, mirror, min_sqnr, .. }) = cli.command else { panic!("not verify") };
         assert_eq!((model, record), (Some("m.pth".into()), Some("r".into())));
         assert_eq!((mirror, min_sqnr), (true, Some(20.5)));
     }

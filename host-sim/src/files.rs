@@ -114,7 +114,7 @@ pub fn load_graph(path: &Path, import: &ImportOptions) -> Result<Graph> {
 #[derive(Clone, Debug, PartialEq, Eq, clap::Args)]
 #[group(required = true, multiple = false)]
 pub struct FrameSource {
-    /// Frame directory: FRAMES/<name>/{rgb.png, lidar.bin, frame.json}.
+    /// Frame directory: a folder per frame with rgb.png, lidar.bin and frame.json.
     #[arg(long, value_name = "DIR")]
     pub frames: Option<PathBuf>,
     /// Raw network inputs by name, first dimension = frames.

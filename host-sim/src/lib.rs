@@ -1,5 +1,6 @@
 //! Runs the firmware's engine on the host and says how good its numbers are.
 //!
+//! * [`demo`]: the whole way on the files of the source tree, without arguments
 //! * [`run`]: waypoints of frames, int8 from an image or f32 from a checkpoint
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
 //!   f32 network: how much precision each step costs
@@ -18,6 +19,7 @@ pub mod buffers;
 pub mod cli;
 pub mod codes;
 pub mod compare;
+pub mod demo;
 pub mod files;
 pub mod report;
 pub mod run;

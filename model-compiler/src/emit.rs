@@ -2,6 +2,7 @@
 //! that is not named in [`firmware::image::layout`].
 
 use crate::error::{Error, ErrorCode, Result};
+use firmware::image::audit::audit;
 use firmware::image::layout::{self, header, region, section};
 use firmware::image::{Image, Port, SectionKind, TensorRecord, crc32};
 use firmware::program::{ConstRange, Step};
@@ -131,7 +132,7 @@ impl ConstantsBuilder {
     }
 }
 
-/// Writes an image and has the runtime's own parser and CRC check accept it.
+/// Writes an image and has the runtime's own parser, CRC check and audit accept it.
 ///
 /// # Errors
 /// `TooBig` or `Malformed` where a part does not fit the format; `Malformed` with the parser's words where the parts
@@ -141,6 +142,7 @@ pub fn emit(parts: &ImageParts) -> Result<Vec<u8>> {
     let aligned = AlignedBytes::from(bytes.as_slice());
     let image = Image::parse(&aligned).map_err(|error| malformed(&parts.name, error.to_string()))?;
     image.check().map_err(|error| malformed(&parts.name, error.to_string()))?;
+    audit(&image).map_err(|error| malformed(&parts.name, error.to_string()))?;
     Ok(bytes)
 }
 
@@ -175,10 +177,9 @@ pub fn assemble(parts: &ImageParts) -> Result<Vec<u8>> {
 /// As [`emit`]; also where `image` is no image.
 pub fn with_known_answer(image: &[u8], known_answer: Option<&KnownAnswer>) -> Result<Vec<u8>> {
     let aligned = AlignedBytes::from(image);
-    let parsed = Image::parse(&aligned).map_err(|error| malformed("image", error.to_string()))?;
-    let end = to_u32(parsed.section(SectionKind::KnownAnswer).len())
-        .map(|_| slot_field(image, SectionKind::KnownAnswer, section::OFFSET))?;
-    let mut bytes = image[..end as usize].to_vec();
+    Image::parse(&aligned).map_err(|error| malformed("image", error.to_string()))?;
+    let start = slot_field(image, SectionKind::KnownAnswer, section::OFFSET) as usize;
+    let mut bytes = image[..start].to_vec();
     append_section(&mut bytes, SectionKind::KnownAnswer, &known_answer_section(known_answer))?;
     let total = to_u32(bytes.len())?;
     bytes[header::TOTAL_BYTES].copy_from_slice(&total.to_le_bytes());

@@ -27,7 +27,7 @@ mod tokens;
 mod waypoint_decoder;
 mod weighted;
 
-pub use inputs::{encode_input, known_answer_inputs};
+pub use inputs::encode_input;
 
 use crate::error::{Error, ErrorCode, Result};
 use crate::qmodel::{Port, QModel, QOp, QStep, QTensor, QTensorId, QTerm};

@@ -10,6 +10,7 @@ pub mod frames;
 pub mod import;
 pub mod integer_reference;
 pub mod ir;
+pub mod known_answer;
 pub mod memory_plan;
 pub mod metrics;
 pub mod pack;

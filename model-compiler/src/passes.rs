@@ -43,7 +43,8 @@ pub fn optimize(graph: &mut Graph) -> Result<()> {
 /// # Errors
 /// `Numeric`: what the verifier found, such as a folded weight that exceeds the range of `f32`.
 pub fn optimize_with(graph: &mut Graph, options: PassOptions) -> Result<()> {
-    let passes: [(&str, &dyn Fn(&mut Graph)); 5] = [
+    type Pass<'a> = &'a dyn Fn(&mut Graph);
+    let passes: [(&str, Pass<'_>); 5] = [
         ("fold_normalization", &fold_normalization::run),
         ("fold_batch_norm", &fold_batch_norm::run),
         ("fuse_residual", &|graph| fuse_residual::run(graph, options.fuse_residual)),

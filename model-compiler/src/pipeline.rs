@@ -7,6 +7,7 @@ use crate::error::{Error, ErrorCode, Result};
 use crate::frames::{self, Frame, FrameFormat};
 use crate::import::{self, ImportOptions, checkpoint};
 use crate::ir::Graph;
+use crate::known_answer::known_answer;
 use crate::memory_plan::{self, PlanOptions};
 use crate::pack::pack;
 use crate::passes::{self, PassOptions};
@@ -98,7 +99,8 @@ pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress:
     })?;
     progress("plan", 1, 1);
     progress("emit", 0, 1);
-    let parts = pack(model, &plan)?;
+    let mut parts = pack(model, &plan)?;
+    parts.known_answer = Some(known_answer(model, &plan)?);
     let image = emit(&parts)?;
     target.fits(model, &plan, image.len() as u64)?;
     progress("emit", 1, 1);

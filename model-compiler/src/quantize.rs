@@ -1,7 +1,7 @@
 //! The quantizer: an optimized graph and its statistics become a [`QModel`], all integers.
 //!
 //! In three moves: [`types`] decides element type, scale and zero point of every value; one builder per operator turns
-//! real weights into integers ([`weighted`], [`sums`], [`token`], [`decoder`]); the interval analysis refuses whatever
+//! real weights into integers (`weighted`, `sums`, `token`, `decoder`); the interval analysis refuses whatever
 //! could leave its type or exceed 2^53. Formulas follow the numerics page, section by section.
 
 use crate::calibrate::{self, Statistics};

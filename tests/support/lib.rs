@@ -1,9 +1,11 @@
 //! Support for the integration tests.
 
 pub mod build;
+pub mod bundle;
 pub mod every_step;
 pub mod golden;
 pub mod mutation;
+pub mod project;
 pub mod random;
 pub mod sketch;
 pub mod torch_file;

@@ -1,6 +1,7 @@
 //! The machine-readable forms: one JSON document per command.
 
 use super::VerifyReport;
+use crate::ablation::Row;
 use crate::run::RunReport;
 use model_compiler::error::Error;
 use model_compiler::memory_plan::PlanStatus;
@@ -19,6 +20,11 @@ pub fn verify(report: &VerifyReport) -> Value {
         document["error"] = error(failure)["error"].take();
     }
     document
+}
+
+/// Document of an ablation.
+pub fn ablation(rows: &[Row]) -> Value {
+    json!({"schema": 1, "variants": to_value(&rows)})
 }
 
 /// `{"error": {"code", "message", "where"}}`.

@@ -1,7 +1,8 @@
 //! The forms for people: tables with a line per frame or step, and a short summary.
 
-use super::{StepReport, VerifyReport};
-use crate::run::{FrameResult, RunReport};
+use super::{FrameReport, StepReport, VerifyReport};
+use crate::ablation::Row;
+use crate::run::{FrameResult, RunReport, Waypoints};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
 
@@ -28,8 +29,35 @@ pub fn verify(report: &VerifyReport) -> String {
     ];
     let rows = report.steps.iter().map(step_row);
     let _ = writeln!(text, "{}\n", table(header.map(str::to_owned).to_vec(), &[1, 2, 3, 4], rows));
-    summary(&mut text, report);
-    text
+    text + &summary(report)
+}
+
+/// Waypoints of the engine and, below, of the f32 network; frame by frame.
+pub fn waypoints(frames: &[FrameReport]) -> String {
+    let longest = frames.iter().flat_map(|f| &f.waypoints).map(Vec::len).max().unwrap_or(0);
+    let columns = (1..=longest).flat_map(|k| [format!("right {k}"), format!("forward {k}")]);
+    let header = ["frame", "network"].map(str::to_owned).into_iter().chain(columns).collect();
+    let row = |frame: &str, network: &str, waypoints: &Waypoints| {
+        let meters = waypoints.iter().flatten().map(|meters| format!("{meters:.3}"));
+        [frame, network].map(str::to_owned).into_iter().chain(meters).collect()
+    };
+    let rows = frames.iter().flat_map(|frame| {
+        let engine = frame.waypoints.iter().map(|w| row(&frame.name, "int8", w));
+        engine.chain(frame.reference_waypoints.iter().map(|w| row("", "f32", w)))
+    });
+    table(header, &[0, 1], rows)
+}
+
+/// One line per variant of the quantizer.
+pub fn ablation(rows: &[Row]) -> String {
+    let waypoints = rows.first().map_or(0, |row| row.fidelity.mean_mm.len());
+    let numbered = |what: &str| (1..=waypoints).map(|k| format!("{what} mm {k}")).collect::<Vec<_>>();
+    let header = [vec!["variant".to_owned(), "vector dB".to_owned()], numbered("mean"), numbered("worst")].concat();
+    let line = |row: &Row| {
+        let millimeters = row.fidelity.mean_mm.iter().chain(&row.fidelity.worst_mm).map(|mm| format!("{mm:.0}"));
+        [row.variant.to_owned(), figure(row.fidelity.vector_sqnr_db.into(), 2)].into_iter().chain(millimeters).collect()
+    };
+    format!("{}\n", table(header, &[0], rows.iter().map(line)))
 }
 
 fn step_row(step: &StepReport) -> Vec<String> {
@@ -52,7 +80,9 @@ fn step_row(step: &StepReport) -> Vec<String> {
     ]
 }
 
-fn summary(text: &mut String, report: &VerifyReport) {
+/// The figures of the whole, a line each.
+pub fn summary(report: &VerifyReport) -> String {
+    let mut text = String::new();
     let s = &report.summary;
     let bytes = if report.bytes_equal { "equal in every step of every frame" } else { "UNEQUAL" };
     let _ = writeln!(text, "engine and f64 model   {bytes} ({} steps, {} frames)", s.steps, report.frames.len());
@@ -76,6 +106,7 @@ fn summary(text: &mut String, report: &VerifyReport) {
         s.arena_status.words()
     );
     let _ = writeln!(text, "flash                  {} B", s.flash_bytes);
+    text
 }
 
 fn figure(value: Option<f64>, digits: usize) -> String {
@@ -133,6 +164,14 @@ mod tests {
             assert!(text.contains(expected), "{expected} in\n{text}");
         }
         assert!(text.contains("equal in every step"), "{text}");
+    }
+
+    #[test]
+    fn both_networks_stand_below_each_other() {
+        let text = waypoints(&super::super::tests::report().frames);
+        let words: Vec<Vec<&str>> = text.lines().map(|line| line.split_whitespace().collect()).collect();
+        assert_eq!(words[0], ["frame", "network", "right", "1", "forward", "1"]);
+        assert_eq!(words[1..], [vec!["a", "int8", "0.000", "1.000"], vec!["f32", "0.000", "1.001"]]);
     }
 
     #[test]

@@ -3,21 +3,24 @@
 //! Rows are lateral: 256 bins from 32 m on the right to 33 m on the left, 65/256 m each. Columns are longitudinal: 256
 //! bins from 32 m ahead (column 0) to the sensor (column 255), 0.125 m each. Bins are half-open, the last one of each
 //! axis is closed, and points outside are left out. All edges are exact in f64, so a point on an edge has one bin.
+//!
+//! A network with a smaller or larger input sees the same area in larger or smaller bins. Numbers of bins are powers of
+//! two, which keeps the edges exact.
 
 use super::ByteMap;
 use firmware::tensor::Shape;
 
-/// The only shape that the rule yields.
-pub const SHAPE: Shape = Shape::map(BINS as u16, BINS as u16, 2);
+/// The published networks' histogram.
+pub const SHAPE: Shape = Shape::map(256, 256, 2);
 /// Height of the sensor that the networks were trained with, m above ground.
 pub const SENSOR_HEIGHT_M: f64 = 2.5;
 /// Counts saturate here.
 pub const MAX_COUNT: u8 = 5;
 
-const BINS: usize = 256;
-const LATERAL: Axis = Axis { start: -32.0, width: 65.0 / 256.0 };
-/// Over `−forward`.
-const LONGITUDINAL: Axis = Axis { start: -32.0, width: 0.125 };
+/// Most bins of an axis.
+const MAX_BINS: u16 = 1024;
+const LATERAL_M: f64 = 65.0;
+const LONGITUDINAL_M: f64 = 32.0;
 
 /// How the raw coordinates of a LiDAR file lie.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,51 +46,69 @@ impl LidarAxes {
     }
 }
 
+/// From −32 m on; the longitudinal axis counts `−forward`.
 struct Axis {
-    start: f64,
+    bins: usize,
     width: f64,
 }
 
 impl Axis {
+    const START: f64 = -32.0;
+
+    fn new(length: f64, bins: u16) -> Self {
+        Self { bins: bins.into(), width: length / f64::from(bins) }
+    }
+
     fn edge(&self, index: usize) -> f64 {
-        self.start + index as f64 * self.width
+        Self::START + index as f64 * self.width
     }
 
     /// The bin with `edge(i) <= value < edge(i + 1)`; the last bin also takes its upper edge.
     fn bin(&self, value: f64) -> Option<usize> {
-        if !(self.edge(0)..=self.edge(BINS)).contains(&value) {
+        if !(self.edge(0)..=self.edge(self.bins)).contains(&value) {
             return None;
         }
         // The quotient may round across an edge; the edges themselves decide.
-        let guess = (((value - self.start) / self.width) as usize).min(BINS - 1);
+        let guess = (((value - Self::START) / self.width) as usize).min(self.bins - 1);
         if value < self.edge(guess) {
             Some(guess - 1)
         } else if value >= self.edge(guess + 1) {
-            Some((guess + 1).min(BINS - 1))
+            Some((guess + 1).min(self.bins - 1))
         } else {
             Some(guess)
         }
     }
 }
 
+/// Whether there is a histogram of this shape: two channels, powers of two up to 1024 as numbers of bins.
+pub fn is_possible(shape: Shape) -> bool {
+    let fits = |bins: u16| bins.is_power_of_two() && bins <= MAX_BINS;
+    shape.channels == 2 && fits(shape.height) && fits(shape.width)
+}
+
 /// Histogram of the finite points, and how many points were not finite.
 ///
 /// Channel 0 counts points up to `split_height_m`, channel 1 those above.
-pub fn histogram(points: impl IntoIterator<Item = Point>, split_height_m: f64) -> (ByteMap, usize) {
-    let mut data = vec![0_u8; BINS * BINS * 2];
+///
+/// # Panics
+/// The shape is not one that [`is_possible`] accepts.
+pub fn histogram(points: impl IntoIterator<Item = Point>, split_height_m: f64, shape: Shape) -> (ByteMap, usize) {
+    assert!(is_possible(shape), "no histogram has the shape {shape:?}");
+    let (lateral, longitudinal) = (Axis::new(LATERAL_M, shape.height), Axis::new(LONGITUDINAL_M, shape.width));
+    let mut data = vec![0_u8; shape.elements() as usize];
     let mut dropped = 0;
     for [left, forward, up] in points {
         if ![left, forward, up].iter().all(|v| v.is_finite()) {
             dropped += 1;
             continue;
         }
-        if let (Some(row), Some(column)) = (LATERAL.bin(left), LONGITUDINAL.bin(-forward)) {
+        if let (Some(row), Some(column)) = (lateral.bin(left), longitudinal.bin(-forward)) {
             let channel = usize::from(up > split_height_m);
-            let count = &mut data[(row * BINS + column) * 2 + channel];
+            let count = &mut data[(row * longitudinal.bins + column) * 2 + channel];
             *count = MAX_COUNT.min(*count + 1);
         }
     }
-    (ByteMap { shape: SHAPE, data }, dropped)
+    (ByteMap { shape, data }, dropped)
 }
 
 #[cfg(test)]
@@ -95,8 +116,8 @@ mod tests {
     use super::*;
 
     fn cells(points: &[Point], split: f64) -> Vec<(usize, usize, usize, u8)> {
-        let (map, _) = histogram(points.iter().copied(), split);
-        let position = |i: usize| (i / 2 / BINS, i / 2 % BINS, i % 2);
+        let (map, _) = histogram(points.iter().copied(), split, SHAPE);
+        let position = |i: usize| (i / 2 / 256, i / 2 % 256, i % 2);
         let found = map.data.iter().enumerate().filter(|(_, count)| **count > 0);
         found.map(|(i, &count)| (position(i).0, position(i).1, position(i).2, count)).collect()
     }
@@ -126,11 +147,23 @@ mod tests {
 
     #[test]
     fn every_edge_and_its_lower_neighbor_fall_into_the_right_bin() {
-        for axis in [&LATERAL, &LONGITUDINAL] {
-            for i in 1..BINS {
+        let axes = [32, 128, 256, 1024].map(|bins| [Axis::new(LATERAL_M, bins), Axis::new(LONGITUDINAL_M, bins)]);
+        for axis in axes.iter().flatten() {
+            for i in 1..axis.bins {
                 assert_eq!(axis.bin(axis.edge(i)), Some(i));
                 assert_eq!(axis.bin(axis.edge(i).next_down()), Some(i - 1));
             }
+        }
+    }
+
+    #[test]
+    fn half_as_many_bins_hold_the_counts_of_two_by_two() {
+        let points = (0..4).map(|i| [-32.0 + f64::from(i % 2) * 65.0 / 256.0, 0.1 + f64::from(i / 2) * 0.125, 0.0]);
+        let (map, _) = histogram(points, -2.0, Shape::map(128, 128, 2));
+        let expected = |i| if i == 127 * 2 + 1 { 4 } else { 0 };
+        assert_eq!(map.data, (0..128 * 128 * 2).map(expected).collect::<Vec<_>>());
+        for (height, width, channels) in [(96, 128, 2), (128, 2048, 2), (0, 128, 2), (128, 128, 1)] {
+            assert!(!is_possible(Shape::map(height, width, channels)), "{height}×{width}×{channels}");
         }
     }
 
@@ -144,7 +177,7 @@ mod tests {
     #[test]
     fn points_that_are_not_finite_are_dropped_and_counted() {
         let points = [[f64::NAN, 1.0, 0.0], [0.0, f64::INFINITY, 0.0], [0.0, 1.0, f64::NEG_INFINITY], [0.0, 1.0, 0.0]];
-        let (map, dropped) = histogram(points, -2.0);
+        let (map, dropped) = histogram(points, -2.0, SHAPE);
         assert_eq!(dropped, 3);
         assert_eq!(map.data.iter().map(|&c| u32::from(c)).sum::<u32>(), 1);
     }

@@ -38,10 +38,10 @@ fn frame_folders(path: &Path) -> Result<Vec<PathBuf>> {
 fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
     let description = Description::read(&folder.join(DESCRIPTION))?;
     let (bev, dropped_points) = match format.bev {
-        Some(shape) if shape != bev::SHAPE => return Err(wrong_histogram_size(folder, shape)),
-        Some(_) => {
+        Some(shape) if !bev::is_possible(shape) => return Err(wrong_histogram_size(folder, shape)),
+        Some(shape) => {
             let points = read_points(&folder.join(LIDAR), &description)?;
-            let (map, dropped) = bev::histogram(points, format.split_height_m);
+            let (map, dropped) = bev::histogram(points, format.split_height_m, shape);
             (Some(map), dropped)
         }
         None => (None, 0),
@@ -59,7 +59,7 @@ fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
 
 fn wrong_histogram_size(folder: &Path, shape: firmware::tensor::Shape) -> Error {
     let message = format!(
-        "the network reads a {}×{}×{} histogram, frame folders give 256×256×2",
+        "the network reads a {}×{}×{} histogram, frame folders give powers of two up to 1024 and 2 channels",
         shape.height, shape.width, shape.channels
     );
     Error::new(ErrorCode::Frames, folder.display().to_string(), message).with_help("feed it with a .safetensors file")

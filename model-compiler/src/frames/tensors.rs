@@ -200,7 +200,7 @@ mod tests {
         let (points, counts) = (file.tensor("points").unwrap(), file.tensor("bev_counts").unwrap());
         let coordinate = |b: &[u8], i: usize| f64::from(f32::from_le_bytes([0, 1, 2, 3].map(|k| b[4 * i + k])));
         let points = points.data().chunks_exact(12).map(|b| [0, 1, 2].map(|i| coordinate(b, i)));
-        let (map, dropped) = bev::histogram(points, -2.0);
+        let (map, dropped) = bev::histogram(points, -2.0, bev::SHAPE);
         assert_eq!(dropped, 0);
         assert_eq!(counts.data().iter().map(|&c| u32::from(c)).sum::<u32>(), 9422);
         for (i, (&found, &expected)) in map.data.iter().zip(counts.data()).enumerate() {

@@ -2,8 +2,8 @@
 //!
 //! Three containers are read, recognized by their content and never by the file's name: the zip archive and the legacy
 //! stream that `torch.save` writes, and safetensors. A torch file holds a pickle, a program for a stack machine that
-//! may call anything; [`pickle`] runs only the few opcodes and globals that build a state dict and refuses the rest by
-//! name, so an unknown file is safe to open.
+//! may call anything; the machine here runs only the few opcodes and globals that build a state dict and refuses the
+//! rest by name, so an unknown file is safe to open.
 //!
 //! Four promises hold for any bytes: no panic; no memory or time beyond a small multiple of the file's length (sizes a
 //! file merely claims are checked before anything is allocated); an error that names the place, what was found, what
@@ -120,7 +120,7 @@ impl Checkpoint {
         self.index.get(name).map(|&at| &self.tensors[at])
     }
 
-    /// Names of entries beside the tensors that were not read (an epoch, hyper-parameters), in file order.
+    /// Names of entries around and among the tensors that were not read (an epoch, hyper-parameters), in file order.
     pub fn skipped(&self) -> &[String] {
         &self.skipped
     }
@@ -150,18 +150,12 @@ impl Checkpoint {
         if contents.tensors.iter().all(|tensor| tensor.name.starts_with(DATA_PARALLEL)) {
             contents.tensors.iter_mut().for_each(|tensor| drop(tensor.name.drain(..DATA_PARALLEL.len())));
         }
-        let mut index = HashMap::with_capacity(contents.tensors.len());
-        for (at, tensor) in contents.tensors.iter().enumerate() {
-            if index.insert(tensor.name.clone(), at).is_some() {
-                let place = format!("tensor {}", quoted(&tensor.name));
-                return Err(malformed(place, "found twice, expected once per file"));
-            }
-        }
+        let index = contents.tensors.iter().enumerate().map(|(at, tensor)| (tensor.name.clone(), at)).collect();
         Ok(Self { tensors: contents.tensors, index, skipped: contents.skipped, sha256, format })
     }
 }
 
-/// What a container's reader returns.
+/// What a container's reader returns; no name occurs twice.
 struct Contents {
     tensors: Vec<NamedTensor>,
     skipped: Vec<String>,

@@ -18,6 +18,9 @@ mod transformer;
 mod transfuser;
 mod weights;
 
+/// Height and width of camera crop and LiDAR histogram as published, pixels.
+const DEFAULT_RESOLUTION: (u16, u16) = (256, 256);
+
 /// Whether some tensor is named like this.
 fn has(tensors: &NamedTensors, prefix: &str) -> bool {
     tensors.under(prefix).next().is_some()

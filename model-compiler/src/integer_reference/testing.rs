@@ -1,7 +1,6 @@
 //! What the tests share: small models, seeded numbers, and the rounding rule once more in wide integers.
 
 use super::execute;
-use super::inputs::splitmix64;
 use crate::error::Result;
 use crate::ir::InputKind;
 use crate::qmodel::{Bounds, Port, QModel, QOp, QRescale, QResidual, QStep, QTensor, QTensorId};
@@ -136,4 +135,12 @@ impl Random {
     pub fn vec<T: TryFrom<i64, Error: std::fmt::Debug>>(&mut self, count: usize, min: i64, max: i64) -> Vec<T> {
         (0..count).map(|_| T::try_from(self.between(min, max)).unwrap()).collect()
     }
+}
+
+/// The finalizer of the SplitMix64 generator, used as a counter-based random function.
+fn splitmix64(state: u64) -> u64 {
+    let z = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    let z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
 }

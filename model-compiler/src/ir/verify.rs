@@ -242,13 +242,11 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
             expect("channels of the second map", inputs[1].channels as usize, channels(inputs[0]))?;
             expect("velocity values", inputs[2].elements() as usize, 1)?;
             let count = 2 * usize::from(h) * usize::from(w);
-            if let Some(p) = &tokens.position {
-                if p.shape != [count, channels(inputs[0])] {
-                    return Err(format!(
-                        "positional embedding: found {:?}, expected [{count}, {}]",
-                        p.shape, inputs[0].channels
-                    ));
-                }
+            if let Some(p) = &tokens.position
+                && p.shape != [count, channels(inputs[0])]
+            {
+                let (found, c) = (&p.shape, inputs[0].channels);
+                return Err(format!("positional embedding: found {found:?}, expected [{count}, {c}]"));
             }
             for v in [&tokens.velocity_weights, &tokens.velocity_bias] {
                 expect("velocity embedding", v.len(), channels(inputs[0]))?;
@@ -270,7 +268,7 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
             arity(op, inputs, 3..=3)?;
             same_shape("key", inputs[1], inputs[0])?;
             same_shape("value", inputs[2], inputs[0])?;
-            if *heads == 0 || inputs[0].channels % heads != 0 {
+            if *heads == 0 || !inputs[0].channels.is_multiple_of(*heads) {
                 return Err(format!("{} channels are not divisible by {heads} heads", inputs[0].channels));
             }
             Ok(inputs[0])

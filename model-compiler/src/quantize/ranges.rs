@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 pub enum RangeRule {
     /// Smallest and largest value seen.
     MinMax,
-    /// The range with the least mean squared error of rounding and clipping together.
+    /// The range with the least squared error of rounding and clipping together, clipping weighted.
     Mse,
 }
 
@@ -23,6 +23,11 @@ pub struct Quantization {
     /// Values outside the range, per million.
     pub saturation_ppm: f64,
 }
+
+/// Clipping pulls every large value the same way, so its error adds up in the sums behind it; rounding errors average
+/// out. Found on the full-size TransFuser: with 1, 4, 16 the pooled vector reached 22.3, 20.3, 25.4 dB with 8-bit maps and
+/// 26.3, 27.2, 29.5 dB with 16-bit skip streams (range of the extremes: 21.6 and 28.3).
+const CLIPPING_WEIGHT: f64 = 16.0;
 
 const CANDIDATES: u32 = 100;
 const SMALLEST_CANDIDATE: u32 = 15;
@@ -61,12 +66,13 @@ impl Moments {
         (self.edges.partition_point(|&x| x < lo), self.edges.partition_point(|&x| x <= hi))
     }
 
-    /// Total squared error of clipping to `[lo, hi]` and rounding to `steps` steps; exact zeros cost nothing.
+    /// Squared error of rounding to `steps` steps plus the weighted one of clipping to `[lo, hi]`; exact zeros cost nothing.
     fn error(&self, lo: f64, hi: f64, steps: f64) -> f64 {
         let (from, to) = self.inside(lo, hi);
         let step = (hi - lo) / steps;
         let rounding = (self.count[to] - self.count[from]) * step * step / 12.0;
-        rounding + self.squared_distance(0, from, lo) + self.squared_distance(to, self.edges.len(), hi)
+        let clipping = self.squared_distance(0, from, lo) + self.squared_distance(to, self.edges.len(), hi);
+        rounding + CLIPPING_WEIGHT * clipping
     }
 
     fn outside_ppm(&self, lo: f64, hi: f64, total: u64) -> f64 {

@@ -1,5 +1,7 @@
 //! A small image with every step kind, in-place pairs, scratch, shared memory and a known answer.
 
+#![allow(dead_code, reason = "each test uses its own subset")]
+
 use firmware::image::TensorRecord;
 use firmware::kernels::plan;
 use firmware::program::*;
@@ -417,10 +419,10 @@ fn place(shapes: &[(Shape, ElementType)], steps: &mut [Step]) -> Vec<TensorRecor
             }
         })
         .collect();
-    for position in 0..steps.len() {
-        let needed = scratch_bytes(&steps[position], &records);
+    for (position, step) in steps.iter_mut().enumerate() {
+        let needed = scratch_bytes(step, &records);
         if needed > 0 {
-            set_scratch(&mut steps[position], TensorId(records.len() as u16));
+            set_scratch(step, TensorId(records.len() as u16));
             records.push(TensorRecord::scratch(0, needed, position as u16));
         }
     }

@@ -1,12 +1,13 @@
 //! From the value a pickle built to named tensors: finds the state dict among its wrappers.
 
 use std::borrow::Cow;
+use std::collections::HashSet;
 
 use crate::error::{Error, ErrorCode, Result};
 
 use super::pickle::{Object, Pickle, Value};
 use super::tensor_view::{StorageRef, TensorView, gather};
-use super::{Contents, quoted};
+use super::{Contents, malformed, quoted};
 
 /// Keys under which training scripts save the weights, the most telling first.
 const WRAPPERS: [&str; 6] = ["state_dict", "model_state_dict", "model", "net", "network", "weights"];
@@ -24,30 +25,47 @@ pub(super) fn read<'s>(
 ) -> Result<Contents> {
     let mut views: Vec<(&str, &TensorView)> = Vec::new();
     let mut skipped = Vec::new();
-    for &(key, value) in find(pickle)? {
+    for &(key, value) in find(pickle, &mut skipped)? {
         match (pickle.text(key), pickle.object(value)) {
             (Some(name), Some(Object::Tensor(view))) => views.push((name, view)),
-            (Some(name), _) => skipped.push(name.to_owned()),
-            (None, _) => skipped.push(format!("({} as a name)", pickle.describe(key))),
+            _ => skipped.push(key_name(pickle, key)),
         }
     }
     Ok(Contents { tensors: gather(&views, file_bytes, load)?, skipped })
 }
 
-/// The dict whose values are the tensors.
-fn find<'p>(pickle: &'p Pickle) -> Result<&'p Items> {
+/// The dict whose values are the tensors; notes what lies beside it.
+fn find<'p>(pickle: &'p Pickle, skipped: &mut Vec<String>) -> Result<&'p Items> {
     let mut value = pickle.root();
     for _ in 0..MAX_WRAPPERS {
         let Some(items) = dict(pickle, value) else {
             return Err(not_found(format!("found {}, expected a dict of tensors", pickle.describe(value))));
         };
+        refuse_repeated_names(pickle, items)?;
         match wrapped(pickle, items) {
-            Some(inner) => value = inner,
+            Some(inner) => {
+                let beside = items.iter().filter(|item| item.1 != inner);
+                skipped.extend(beside.map(|item| key_name(pickle, item.0)));
+                value = inner;
+            }
             None if holds_tensors(pickle, items) => return Ok(items),
             None => return Err(not_found(contents_message(pickle, items))),
         }
     }
     Err(not_found(format!("found more than {MAX_WRAPPERS} dicts around the weights, expected fewer")))
+}
+
+/// Python writes a name once; a file that repeats one could also make two bytes of it a long copy each.
+fn refuse_repeated_names(pickle: &Pickle, items: &Items) -> Result<()> {
+    let mut seen = HashSet::with_capacity(items.len());
+    match items.iter().filter_map(|item| pickle.text(item.0)).find(|name| !seen.insert(*name)) {
+        None => Ok(()),
+        Some(name) => Err(malformed(format!("tensor {}", quoted(name)), "found twice, expected once per file")),
+    }
+}
+
+fn key_name(pickle: &Pickle, key: Value) -> String {
+    pickle.text(key).map_or_else(|| format!("({} as a name)", pickle.describe(key)), str::to_owned)
 }
 
 /// The dict that wraps the weights here: under a well-known key, or else the only dict of tensors beside no tensor.

@@ -1,7 +1,7 @@
 //! AIM: the camera image alone.
 
 use super::builder::Builder;
-use super::{has, head, resnet::ResNet};
+use super::{DEFAULT_RESOLUTION, has, head, resnet::ResNet};
 use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::Op;
@@ -11,7 +11,7 @@ pub(super) fn recognize(tensors: &NamedTensors) -> bool {
 }
 
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
-    let resolution = b.options.resolution.unwrap_or(super::transfuser::DEFAULT_RESOLUTION);
+    let resolution = b.options.resolution.unwrap_or(DEFAULT_RESOLUTION);
     let network = ResNet::detect(&b.tensors, "image_encoder.features", None);
     let rgb = b.rgb("image_encoder", resolution)?;
     let mut map = network.stem(b, rgb, 3)?;

@@ -1,7 +1,7 @@
 //! Late Fusion: camera and LiDAR networks side by side, their features added.
 
 use super::builder::Builder;
-use super::{has, head, resnet::ResNet};
+use super::{DEFAULT_RESOLUTION, has, head, resnet::ResNet};
 use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::Op;
@@ -14,7 +14,7 @@ pub(super) fn recognize(tensors: &NamedTensors) -> bool {
 }
 
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
-    let resolution = b.options.resolution.unwrap_or(super::transfuser::DEFAULT_RESOLUTION);
+    let resolution = b.options.resolution.unwrap_or(DEFAULT_RESOLUTION);
     let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
     let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);

@@ -1,16 +1,13 @@
 //! TransFuser: camera and LiDAR networks, fused by a transformer after each of their stages.
 
 use super::builder::Builder;
-use super::{has, head, resnet::ResNet, transformer::Transformer};
+use super::{DEFAULT_RESOLUTION, has, head, resnet::ResNet, transformer::Transformer};
 use crate::error::{Error, ErrorCode, Result};
 use crate::import::NamedTensors;
 use crate::ir::{InputKind, Op, Shape};
 
 const IMAGE: &str = "encoder.image_encoder.features";
 const LIDAR: &str = "encoder.lidar_encoder._model";
-
-/// Camera crop and LiDAR histogram as published, pixels.
-pub(super) const DEFAULT_RESOLUTION: (u16, u16) = (256, 256);
 
 /// Pixels per token of the last stage: the networks halve the resolution five times.
 const TOTAL_STRIDE: u16 = 32;

@@ -20,13 +20,15 @@ pub enum Global {
 }
 
 /// Names that training frameworks put beside the weights.
-const INERT: [(&str, &str); 22] = [
+const INERT: [(&str, &str); 24] = [
     ("__builtin__", "dict"),
+    ("__builtin__", "frozenset"),
     ("__builtin__", "list"),
     ("__builtin__", "set"),
     ("_codecs", "encode"),
     ("argparse", "Namespace"),
     ("builtins", "dict"),
+    ("builtins", "frozenset"),
     ("builtins", "list"),
     ("builtins", "set"),
     ("collections", "Counter"),

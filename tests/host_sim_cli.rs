@@ -1,0 +1,147 @@
+//! The command line of host-sim on a whole small network: files in, exit status and output as a user sees them.
+
+use model_compiler::artifact;
+use model_compiler::import::System;
+use model_compiler::pipeline::{self, Compiled};
+use serde_json::Value;
+use tests::project::Project;
+
+fn waypoints(document: &Value, frame: usize, field: &str) -> Vec<f64> {
+    let pairs = document["frames"][frame][field].as_array().expect("waypoints");
+    pairs.iter().flat_map(|pair| pair.as_array().unwrap()).map(|v| v.as_f64().unwrap()).collect()
+}
+
+#[test]
+fn run_gives_waypoints_of_an_image_and_of_its_checkpoint() {
+    let project = Project::new(System::LateFusion);
+    let (status, int8) = project.json("run net.img --inputs inputs.safetensors --json");
+    assert_eq!(status, 0, "{int8}");
+    let (status, float) = project.json("run net.safetensors --inputs inputs.safetensors --json");
+    assert_eq!(status, 0, "{float}");
+    assert_eq!(int8["schema"], 1);
+    assert_eq!(int8["model"]["sha256"], artifact::hex(&project.compiled.record.image_sha256));
+    assert_eq!(float["model"]["name"], "net");
+    assert_eq!(int8["frames"].as_array().unwrap().len(), float["frames"].as_array().unwrap().len());
+    for frame in 0..2 {
+        assert_eq!(int8["frames"][frame]["name"], format!("inputs#{frame}"));
+        let (int8, float) = (waypoints(&int8, frame, "waypoints"), waypoints(&float, frame, "waypoints"));
+        assert_eq!(int8.len(), 8);
+        let largest = float.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
+        for (i, f) in int8.iter().zip(&float) {
+            assert!((i - f).abs() < 0.2 * largest, "int8 {int8:?}, f32 {float:?}");
+        }
+    }
+    let table = project.host_sim("run net.img --inputs inputs.safetensors");
+    assert!(table.out.contains("forward 4") && table.out.contains("inputs#0"), "{}", table.out);
+    assert_eq!(table.err, "");
+}
+
+#[test]
+fn verify_proves_bytes_and_measures_every_step() {
+    let project = Project::new(System::TransFuser);
+    let (status, report) =
+        project.json("verify net.img --model net.safetensors --inputs inputs.safetensors --mirror --json");
+    assert_eq!((status, &report["passed"], &report["bytes_equal"]), (0, &true.into(), &true.into()), "{report}");
+    let steps = report["steps"].as_array().unwrap();
+    assert_eq!(steps.len(), project.compiled.record.model.steps.len());
+    for step in steps {
+        assert_eq!(step["bytes_equal"], true);
+        let measured = step["cosine"].is_f64() && step["max_error_lsb"].is_f64();
+        assert!(measured, "a step without a counterpart in the f32 network: {step}");
+    }
+    // The frames of the file are the calibration frames; their mirror images are not.
+    let frames = report["frames"].as_array().unwrap();
+    let known = report["calibration_frames"].as_array().unwrap();
+    assert_eq!((frames.len(), known.len()), (8, 4));
+    assert_eq!(frames[4]["calibration"], false);
+    assert_eq!(report["summary"]["waypoint_error_mm"].as_array().unwrap().len(), 4);
+    assert_eq!(report["summary"]["flash_bytes"], project.compiled.image.len());
+}
+
+#[test]
+fn verify_speaks_to_people() {
+    let project = Project::new(System::Aim);
+    let outcome = project.host_sim("verify net.img --model net.safetensors --inputs inputs.safetensors --min-sqnr 0");
+    assert_eq!(outcome.status, 0, "{}", outcome.err);
+    assert!(outcome.err.starts_with("warning: 4 of 4 frames are also calibration frames"), "{}", outcome.err);
+    for expected in ["SQNR dB", "equal in every step of every frame", "waypoint 4", "arena", "flash"] {
+        assert!(outcome.out.contains(expected), "{expected}:\n{}", outcome.out);
+    }
+    // Without the f32 network only bytes are compared.
+    let bytes_only = project.host_sim("verify net.img --inputs inputs.safetensors");
+    assert!(bytes_only.status == 0 && !bytes_only.out.contains("waypoint 1"), "{}", bytes_only.out);
+}
+
+#[test]
+fn a_missed_gate_is_exit_status_one_and_names_the_step() {
+    let project = Project::new(System::Aim);
+    let command = "verify net.img --model net.safetensors --inputs inputs.safetensors --min-sqnr 200";
+    let outcome = project.host_sim(command);
+    assert_eq!(outcome.status, 1);
+    assert!(
+        outcome.err.contains("error: step ") && outcome.err.contains("the gate asks for 200 dB"),
+        "{}",
+        outcome.err
+    );
+    let (status, report) = project.json(&format!("{command} --json"));
+    assert_eq!((status, &report["passed"], &report["bytes_equal"]), (1, &false.into(), &true.into()));
+    assert_eq!(report["error"]["code"], "check");
+}
+
+#[test]
+fn one_altered_weight_is_found_and_named() {
+    use firmware::image::{Image, SectionKind};
+    use model_compiler::emit::{AlignedBytes, reseal};
+    let project = Project::new(System::Aim);
+    let Compiled { mut image, mut record } = project.compiled.clone();
+    let offset = {
+        let aligned = AlignedBytes::from(image.as_slice());
+        let constants = Image::parse(&aligned).unwrap().section(SectionKind::Constants).as_ptr().addr();
+        constants - aligned.as_ptr().addr()
+    };
+    // The first constants are the weights of the first convolution.
+    image[offset] ^= 0x20;
+    reseal(&mut image);
+    record.image_sha256 = artifact::sha256(&image);
+    pipeline::write(&Compiled { image, record }, &project.path("altered.img")).unwrap();
+    let outcome = project.host_sim("verify altered.img --inputs inputs.safetensors");
+    assert_eq!(outcome.status, 1, "{}", outcome.out);
+    let first = &project.compiled.record.model;
+    let first = &first.steps[project.compiled.record.plan.order[0] as usize].name;
+    assert!(outcome.err.contains(&format!("step 0 {first}: the engine differs from the f64 model")), "{}", outcome.err);
+    let (status, report) = project.json("verify altered.img --inputs inputs.safetensors --json");
+    assert_eq!((status, &report["first_difference"]["position"]), (1, &0.into()));
+    assert_ne!(report["first_difference"]["found"], report["first_difference"]["expected"]);
+}
+
+#[test]
+fn bad_input_is_exit_status_two_and_says_where() {
+    let project = Project::new(System::Aim);
+    std::fs::write(project.path("empty.img"), b"").unwrap();
+    std::fs::create_dir(project.path("frames")).unwrap();
+    let cases = [
+        ("run nothing.img --inputs inputs.safetensors", "nothing.img: "),
+        ("run net.img --inputs nothing.safetensors", "nothing.safetensors: "),
+        ("run net.img --frames frames", "holds no frame folder"),
+        ("run net.img --inputs frames", "--inputs takes a file"),
+        ("run net.img --frames inputs.safetensors", "--frames takes a directory"),
+        ("run net.img --inputs net.safetensors", "tensor `rgb`: missing"),
+        ("verify empty.img --inputs inputs.safetensors", "this is no model image"),
+        ("verify net.img --record net.img --inputs inputs.safetensors", "this is not a build record"),
+        ("verify net.img --inputs inputs.safetensors --min-sqnr 3", "needs the f32 network"),
+        (
+            "verify net.img --model net.safetensors --resolution 64x64 --inputs inputs.safetensors",
+            "give the checkpoint that the image was compiled from",
+        ),
+        ("verify net.img", "required arguments"),
+    ];
+    for (command, expected) in cases {
+        let outcome = project.host_sim(command);
+        assert_eq!((outcome.status, outcome.out.as_str()), (2, ""), "{command}");
+        assert!(outcome.err.contains(expected), "{command}: {}", outcome.err);
+        let (status, document) = project.json(&format!("{command} --json"));
+        assert_eq!(status, 2);
+        let error = &document["error"];
+        assert!(error["code"].is_string() && error["message"].is_string() && error["where"].is_string(), "{document}");
+    }
+}
