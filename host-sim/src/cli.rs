@@ -11,8 +11,9 @@ use indicatif::{ProgressBar, ProgressStyle};
 use model_compiler::cli::ImportArgs;
 use model_compiler::error::{Error, ErrorCode, Result};
 use std::ffi::OsString;
-use std::io::Write;
 use std::path::PathBuf;
+
+pub use model_compiler::cli::Console;
 
 const EXAMPLES: &str =
     "Without a command: the demo. It compiles the bundled network (small and untrained), runs it, verifies every
@@ -108,14 +109,6 @@ struct Common {
     #[cfg(feature = "fault-injection")]
     #[arg(long, value_name = "NAME")]
     fault: Option<String>,
-}
-
-/// Where the command line writes: results to `out`, everything else to `err`.
-pub struct Console<'a> {
-    /// Standard output.
-    pub out: &'a mut dyn Write,
-    /// Standard error.
-    pub err: &'a mut dyn Write,
 }
 
 /// Parses the arguments (the first is the program), runs the command, prints its result; returns the exit status.
@@ -265,17 +258,6 @@ fn usage(error: &clap::Error, json: bool, console: &mut Console<'_>) -> u8 {
     }
     let message = text.strip_prefix("error: ").unwrap_or(&text).split("\n\nUsage:").next().unwrap_or_default();
     fail(&Error::new(ErrorCode::Usage, "command line", message.trim()), true, console)
-}
-
-/// A closed pipe is the reader's choice and no error.
-impl Console<'_> {
-    fn print(&mut self, text: &str) {
-        let _ = writeln!(self.out, "{}", text.trim_end());
-    }
-
-    fn complain(&mut self, text: &str) {
-        let _ = writeln!(self.err, "{text}");
-    }
 }
 
 /// On stderr, and only if that is a terminal.

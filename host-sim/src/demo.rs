@@ -16,6 +16,7 @@ use crate::verify;
 use indicatif::ProgressBar;
 use model_compiler::artifact;
 use model_compiler::error::{Error, ErrorCode, Result};
+use model_compiler::frames::Frame;
 use model_compiler::import::ImportOptions;
 use model_compiler::ir::Graph;
 use model_compiler::memory_plan::PlanOptions;
@@ -126,10 +127,11 @@ fn imported(bundle: &Bundle, graph: &Graph) -> String {
 
 fn quantized(bundle: &Bundle, graph: &Graph, progress: &ProgressBar, say: &mut dyn FnMut(&str)) -> Result<QModel> {
     let folder = bundle.frames("calibration");
-    let frames = pipeline::load_frames(graph, &folder)?;
+    let mut frames = pipeline::load_frames(graph, &folder)?;
+    frames.extend(frames.iter().map(Frame::mirrored).collect::<Vec<_>>());
     let mut show = |stage: &str, done: usize, total: usize| show_stage(progress, stage, done, total);
     let model = pipeline::quantize_graph(graph, &frames, &QuantizeOptions::default(), &mut show)?;
-    say(&format!("calibrate  {} frames of {}", frames.len(), shown(&folder)));
+    say(&format!("calibrate  {} frames: those of {} and their mirror images", frames.len(), shown(&folder)));
     say(&format!("quantize   {} tensors, {} integer steps", model.tensors.len(), model.steps.len()));
     Ok(model)
 }
@@ -161,7 +163,7 @@ fn results(bundle: &Bundle, out: &Path, report: &VerifyReport) -> String {
         "verify     {} frames: those of {frames} and their mirror images\n\n\
          Waypoints in meters (of an untrained network: they mean nothing)\n\n{}\n\n{}{pooled}\n\
          Written to {}: demo.img (to flash), demo.record (what it is made of), report.json (every step)\n\
-         Once more by hand: cargo run --release -p host-sim -- verify {} --model {} --frames {frames}",
+         Once more by hand: cargo run --release -p host-sim -- verify {} --model {} --frames {frames} --mirror",
         report.frames.len(),
         terminal::waypoints(&report.frames),
         terminal::summary(report),

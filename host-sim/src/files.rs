@@ -36,12 +36,12 @@ impl ImageFile {
     /// The image behind the bytes.
     ///
     /// # Errors
-    /// The runtime's own check refuses it.
+    /// The runtime's own checks refuse it, those over all bytes included.
     pub fn parse(&self) -> Result<Image<'_>> {
-        let refuse = |e: firmware::image::ParseError| {
-            Error::new(ErrorCode::Malformed, self.path.display().to_string(), e.to_string())
-        };
-        Image::parse(&self.bytes).map_err(refuse)
+        let refuse = |error: Error| error.within(self.path.display());
+        let image = Image::parse(&self.bytes).map_err(|e| refuse(e.into()))?;
+        image.check().map_err(|e| refuse(e.into()))?;
+        Ok(image)
     }
 
     /// SHA-256 of the file.

@@ -7,6 +7,7 @@ use serde::{Serialize, de::DeserializeOwned};
 use sha2::{Digest, Sha256};
 use std::io::Write;
 use std::path::Path;
+use tempfile::NamedTempFile;
 
 const HEADER_BYTES: usize = 48;
 const FORMAT: u32 = 1;
@@ -96,15 +97,33 @@ pub fn read<T: Artifact>(path: &Path) -> Result<T> {
 /// # Errors
 /// The folder does not exist or cannot be written.
 pub fn write_file(path: &Path, bytes: &[u8]) -> Result<()> {
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let write = || -> std::io::Result<()> {
-        let mut file = tempfile::NamedTempFile::new_in(folder)?;
-        file.write_all(bytes)?;
-        file.as_file().sync_all()?;
-        file.persist(path).map_err(|e| e.error)?;
-        Ok(())
+    write_files(&[(path, bytes)])
+}
+
+/// Writes files that belong together: none gets its name before all are on the disk.
+///
+/// # Errors
+/// A folder does not exist or cannot be written.
+pub fn write_files(files: &[(&Path, &[u8])]) -> Result<()> {
+    let stage = |(path, bytes): &(&Path, &[u8])| {
+        let write = || -> std::io::Result<NamedTempFile> {
+            let mut file = NamedTempFile::new_in(folder_of(path))?;
+            file.write_all(bytes)?;
+            file.as_file().sync_all()?;
+            Ok(file)
+        };
+        write().map_err(|e| Error::io(path, &e))
     };
-    write().map_err(|e| Error::io(path, &e))
+    let staged: Vec<NamedTempFile> = files.iter().map(stage).collect::<Result<_>>()?;
+    for (file, (path, _)) in staged.into_iter().zip(files) {
+        file.persist(path).map_err(|e| Error::io(path, &e.error))?;
+    }
+    Ok(())
+}
+
+/// The folder that a file lies in.
+pub fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))
 }
 
 #[cfg(test)]

@@ -1,4 +1,6 @@
-//! Commands: `quantize`, `compile`, `inspect`.
+//! The command line: `quantize`, `compile`, `inspect`.
+//!
+//! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
 use crate::artifact;
 use crate::error::{Error, ErrorCode, Result};
@@ -12,9 +14,14 @@ use crate::quantize::{QuantizeOptions, RangeRule, SkipStages};
 use crate::target::{Target, parse_size};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use indicatif::{ProgressBar, ProgressStyle};
+use std::ffi::OsString;
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+mod console;
 mod inspect;
+
+pub use console::Console;
 
 /// Trained driving networks to int8 model images.
 #[derive(Debug, Parser)]
@@ -78,7 +85,7 @@ struct QuantizeArgs {
     #[arg(long)]
     no_bias_correction: bool,
     /// Fastest velocity to be driven, m/s: the token streams leave room for it.
-    #[arg(long, default_value_t = 10.0, value_name = "M/S")]
+    #[arg(long, default_value_t = 10.0, value_name = "M/S", value_parser = positive)]
     max_velocity: f64,
 }
 
@@ -89,7 +96,7 @@ pub struct ImportArgs {
     #[arg(long, value_name = "SYSTEM")]
     system: Option<String>,
     /// Attention heads (no tensor tells).
-    #[arg(long, default_value_t = 4)]
+    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u16).range(1..))]
     heads: u16,
     /// Height and width of the network's image and BEV inputs; told from the tensors where they tell it, else 256x256.
     #[arg(long, value_name = "HxW")]
@@ -112,6 +119,11 @@ impl std::str::FromStr for Resolution {
     }
 }
 
+fn positive(text: &str) -> std::result::Result<f64, String> {
+    let value = text.parse::<f64>().ok().filter(|v| v.is_finite() && *v > 0.0);
+    value.ok_or_else(|| format!("found {text:?}, expected a positive number"))
+}
+
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Ranges {
     /// Least mean squared error of rounding and clipping.
@@ -120,17 +132,21 @@ enum Ranges {
     Minmax,
 }
 
+fn size(text: &str) -> std::result::Result<u64, String> {
+    parse_size(text).map_err(|e| format!("{}, {}", e.message, e.help))
+}
+
 #[derive(Debug, Args)]
 struct TargetArgs {
     /// Built-in target name, or a .toml file that describes one.
     #[arg(long, default_value = "portable", value_name = "NAME|FILE.toml")]
     target: String,
     /// RAM for the arena: bytes, or with K or M.
-    #[arg(long, value_name = "BYTES")]
-    ram: Option<String>,
+    #[arg(long, value_name = "BYTES", value_parser = size)]
+    ram: Option<u64>,
     /// Flash for the image: bytes, or with K or M.
-    #[arg(long, value_name = "BYTES")]
-    flash: Option<String>,
+    #[arg(long, value_name = "BYTES", value_parser = size)]
+    flash: Option<u64>,
     /// Give the output of a max pool its own memory.
     #[arg(long)]
     no_in_place_pooling: bool,
@@ -142,7 +158,8 @@ impl ImportArgs {
     /// # Errors
     /// A system that does not exist.
     pub fn options(&self) -> Result<ImportOptions> {
-        let system = self.system.as_deref().map(str::parse).transpose()?;
+        let system = self.system.as_deref().map(str::parse).transpose();
+        let system = system.map_err(|e: Error| e.within("--system"))?;
         Ok(ImportOptions { system, heads: self.heads, resolution: self.resolution.map(|Resolution(h, w)| (h, w)) })
     }
 }
@@ -178,54 +195,128 @@ impl QuantizeArgs {
 
 impl TargetArgs {
     fn target(&self) -> Result<Target> {
-        let size = |text: &Option<String>| text.as_deref().map(parse_size).transpose();
-        Ok(Target::find(&self.target)?.with_limits(size(&self.ram)?, size(&self.flash)?))
+        Ok(Target::find(&self.target)?.with_limits(self.ram, self.flash))
+    }
+
+    fn plan_options(&self, target: &Target) -> PlanOptions {
+        PlanOptions { in_place_pooling: !self.no_in_place_pooling, ..PlanOptions::for_target(target) }
     }
 }
 
-impl Cli {
-    /// Runs the command.
-    ///
-    /// # Errors
-    /// Whatever stopped it; nothing half-written is left behind.
-    pub fn run(self) -> Result<()> {
-        let mut bar = Bar::new();
-        match self.command {
-            Command::Quantize { model, quantize, output } => {
-                let quantized = quantize.quantized(&model, &mut bar)?;
-                let bytes = artifact::to_bytes(&quantized)?;
-                artifact::write_file(&output, &bytes)?;
-                bar.finish();
-                println!("{}: {} steps, {} B", output.display(), quantized.steps.len(), bytes.len());
-            }
-            Command::Compile { model, quantize, target, output } => {
-                let target_data = target.target()?;
-                let quantized = if is_quantized(&model)? {
-                    artifact::read::<QModel>(&model)?
-                } else {
-                    quantize.quantized(&model, &mut bar)?
-                };
-                let options = PlanOptions { in_place_pooling: !target.no_in_place_pooling, ..PlanOptions::default() };
-                let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t))?;
-                pipeline::write(&compiled, &output)?;
-                bar.finish();
-                for (key, value) in pipeline::summary(&compiled) {
-                    println!("{key:>8}  {value}");
-                }
-                println!("{:>8}  {}", "written", output.display());
-            }
-            Command::Inspect { file } => inspect::inspect(&file)?,
+/// Parses the arguments (the first is the program), runs the command, prints its result; returns the exit status.
+pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<'_>) -> u8 {
+    let cli = match Cli::try_parse_from(arguments) {
+        Ok(cli) => cli,
+        Err(error) if error.use_stderr() => {
+            console.complain(&error.render().to_string());
+            return ErrorCode::Usage.exit_status();
         }
-        Ok(())
+        Err(help) => {
+            console.print(&help.render().to_string());
+            return 0;
+        }
+    };
+    let mut bar = Bar::new();
+    let result = cli.command.execute(&mut bar, &mut console);
+    bar.finish();
+    match result {
+        Ok(text) => {
+            console.print(&text);
+            0
+        }
+        Err(error) => {
+            console.complain(&format!("error: {error}"));
+            error.code.exit_status()
+        }
     }
+}
+
+impl Command {
+    /// Runs the command; what it has to say is for standard output. Nothing half-written is left behind.
+    fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<String> {
+        match self {
+            Self::Quantize { model, quantize, output } => run_quantize(model, quantize, output, bar),
+            Self::Compile { model, quantize, target, output } => {
+                run_compile(model, quantize, target, output, bar, console)
+            }
+            Self::Inspect { file } => inspect::inspect(file),
+        }
+    }
+}
+
+fn run_quantize(model: &Path, quantize: &QuantizeArgs, output: &Path, bar: &mut Bar) -> Result<String> {
+    check_output(output, model)?;
+    if is_quantized(model)? {
+        let error = Error::new(ErrorCode::Usage, model.display().to_string(), "this model is quantized already");
+        return Err(error.with_help("model-compiler compile makes an image of it"));
+    }
+    let quantized = quantize.quantized(model, bar)?;
+    let bytes = artifact::to_bytes(&quantized)?;
+    artifact::write_file(output, &bytes)?;
+    Ok(format!("{}: {} steps, {} B", output.display(), quantized.steps.len(), bytes.len()))
+}
+
+fn run_compile(
+    model: &Path,
+    quantize: &QuantizeArgs,
+    target: &TargetArgs,
+    output: &Path,
+    bar: &mut Bar,
+    console: &mut Console<'_>,
+) -> Result<String> {
+    check_output(output, model)?;
+    let record = pipeline::record_path(output);
+    if record == output {
+        let error = Error::new(ErrorCode::Usage, output.display().to_string(), "this name is for the record");
+        return Err(error.with_help("give the image another extension, such as .img"));
+    }
+    check_output(&record, model)?;
+    let target_data = target.target()?;
+    let quantized = if is_quantized(model)? {
+        if quantize.calib.is_some() {
+            console.complain(&format!("warning: {} is quantized already; --calib has no effect", model.display()));
+        }
+        artifact::read::<QModel>(model)?
+    } else {
+        quantize.quantized(model, bar)?
+    };
+    let options = target.plan_options(&target_data);
+    let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t));
+    let compiled = compiled.map_err(|e| e.within(model.display()))?;
+    pipeline::write(&compiled, output)?;
+    let mut text = String::new();
+    for (key, value) in pipeline::summary(&compiled) {
+        let _ = writeln!(text, "{key:>8}  {value}");
+    }
+    let _ = writeln!(text, "{:>8}  {}", "written", output.display());
+    Ok(text)
+}
+
+/// Before minutes of work: whether the output can be written where it shall go, and is not the input.
+fn check_output(output: &Path, input: &Path) -> Result<()> {
+    let refuse = |code, path: &Path, message: &str, help: &str| {
+        Err(Error::new(code, path.display().to_string(), message).with_help(help))
+    };
+    let folder = artifact::folder_of(output);
+    if !folder.is_dir() {
+        return refuse(ErrorCode::Io, output, &format!("there is no folder {}", folder.display()), "create it first");
+    }
+    if output.is_dir() {
+        return refuse(ErrorCode::Io, output, "this is a folder, expected the name of a file", "add a file name");
+    }
+    let same = output.canonicalize().is_ok_and(|o| input.canonicalize().is_ok_and(|i| o == i));
+    if same {
+        return refuse(ErrorCode::Usage, output, "the output would replace the input", "give it another name");
+    }
+    Ok(())
 }
 
 fn is_quantized(path: &Path) -> Result<bool> {
     use std::io::Read;
-    let mut head = [0; 8];
-    let mut file = std::fs::File::open(path).map_err(|e| Error::io(path, &e))?;
-    let count = file.read(&mut head).map_err(|e| Error::io(path, &e))?;
-    Ok(artifact::is::<QModel>(&head[..count]))
+    let mut head = Vec::new();
+    let file = std::fs::File::open(path).map_err(|e| Error::io(path, &e))?;
+    file.take(8).read_to_end(&mut head).map_err(|e| Error::io(path, &e))?;
+    Ok(artifact::is::<QModel>(&head))
 }
 
 /// A progress bar on standard error, drawn only on a terminal.

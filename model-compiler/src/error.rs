@@ -1,5 +1,6 @@
 //! The one error of the host tools: what went wrong, where, and what to do about it.
 
+use firmware::image::{Check, CheckError, ParseError};
 use std::fmt;
 
 /// Class of an error; the string form is the `code` of the JSON output.
@@ -89,9 +90,32 @@ impl Error {
 
     /// A failed file operation.
     pub fn io(path: &std::path::Path, error: &std::io::Error) -> Self {
-        Self::new(ErrorCode::Io, path.display().to_string(), error.to_string())
+        let help = match error.kind() {
+            std::io::ErrorKind::NotFound => "check the path",
+            std::io::ErrorKind::PermissionDenied => "check who may read and write there",
+            _ => "",
+        };
+        Self::new(ErrorCode::Io, path.display().to_string(), error.to_string()).with_help(help)
     }
 }
+
+impl From<ParseError> for Error {
+    fn from(error: ParseError) -> Self {
+        let help = match error.check {
+            Check::Format | Check::Features => "compile the model again with the compiler of this version",
+            _ => DAMAGED_IMAGE,
+        };
+        Self::new(ErrorCode::Malformed, "", error.to_string()).with_help(help)
+    }
+}
+
+impl From<CheckError> for Error {
+    fn from(error: CheckError) -> Self {
+        Self::new(ErrorCode::Malformed, "", error.to_string()).with_help(DAMAGED_IMAGE)
+    }
+}
+
+const DAMAGED_IMAGE: &str = "the image is damaged or incomplete: copy it again, or compile the model again";
 
 impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {

@@ -1,16 +1,10 @@
-//! The command line of the model compiler.
+//! The command line of the model compiler; see [`model_compiler::cli`].
 #![forbid(unsafe_code)]
 
-use clap::Parser;
-use model_compiler::cli::Cli;
+use model_compiler::cli::{self, Console};
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    match Cli::parse().run() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::from(error.code.exit_status())
-        }
-    }
+    let console = Console { out: &mut std::io::stdout(), err: &mut std::io::stderr() };
+    ExitCode::from(cli::main(std::env::args_os(), console))
 }

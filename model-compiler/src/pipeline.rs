@@ -59,7 +59,7 @@ pub fn quantize_graph(
     let digests: Vec<String> = calibration.iter().map(Frame::short_digest).collect();
     model.provenance = vec![
         ("calibration_frames".into(), digests.join(",")),
-        ("skip_stages".into(), format!("{:?}", options.skip)),
+        ("skip_stages".into(), options.skip.to_string()),
         ("ranges".into(), format!("{:?}", options.ranges)),
         ("bias_correction".into(), options.bias_correction.to_string()),
         ("wide_stream".into(), options.wide_stream.to_string()),
@@ -112,11 +112,10 @@ pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress:
 /// Writes `OUT.img` and `OUT.record`.
 ///
 /// # Errors
-/// A file cannot be written; then neither is left half-written.
+/// A file cannot be written; then neither is left half-written, nor one without the other.
 pub fn write(compiled: &Compiled, image_path: &Path) -> Result<()> {
     let record = artifact::to_bytes(&compiled.record)?;
-    artifact::write_file(&record_path(image_path), &record)?;
-    artifact::write_file(image_path, &compiled.image)
+    artifact::write_files(&[(&record_path(image_path), &record), (image_path, &compiled.image)])
 }
 
 /// The record that belongs to an image: the same name with the extension `record`.

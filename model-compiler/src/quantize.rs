@@ -12,6 +12,7 @@ use firmware::program::Clamp;
 use firmware::tensor::ElementType;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
+use std::fmt;
 
 mod decoder;
 pub mod factors;
@@ -28,6 +29,9 @@ pub use ranges::RangeRule;
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SkipStages(Vec<u8>);
 
+/// ResNets have a stem and four stages.
+const LAST_STAGE: u8 = 4;
+
 impl SkipStages {
     /// All skip values in 8 bits.
     pub fn narrow() -> Self {
@@ -36,12 +40,33 @@ impl SkipStages {
 
     /// All skip values in 16 bits.
     pub fn wide() -> Self {
-        Self((0..=u8::MAX).collect())
+        Self((0..=LAST_STAGE).collect())
+    }
+
+    /// These stages in 16 bits, in any order.
+    fn of(mut stages: Vec<u8>) -> Self {
+        stages.sort_unstable();
+        stages.dedup();
+        Self(stages)
     }
 
     /// Whether a stage is kept in 16 bits.
     pub fn is_wide(&self, stage: u8) -> bool {
         self.0.contains(&stage)
+    }
+}
+
+/// The form that `FromStr` reads.
+impl fmt::Display for SkipStages {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.0.is_empty() {
+            write!(f, "i8")
+        } else if *self == Self::wide() {
+            write!(f, "i16")
+        } else {
+            let stages: Vec<String> = self.0.iter().map(u8::to_string).collect();
+            write!(f, "{}", stages.join(","))
+        }
     }
 }
 
@@ -53,10 +78,12 @@ impl std::str::FromStr for SkipStages {
         match text {
             "i8" => Ok(Self::narrow()),
             "i16" => Ok(Self::wide()),
-            list => list.split(',').map(|s| s.trim().parse::<u8>()).collect::<std::result::Result<_, _>>().map_or_else(
-                |_| Err(format!("found {list:?}, expected i8, i16 or a list of 16-bit stages such as 0,1,2")),
-                |stages| Ok(Self(stages)),
-            ),
+            list => {
+                let stage = |s: &str| s.trim().parse::<u8>().ok().filter(|&stage| stage <= LAST_STAGE);
+                let stages: Option<Vec<u8>> = list.split(',').map(stage).collect();
+                let expected = "expected i8, i16 or a list of 16-bit stages 0..4 such as 0,1,2 (0 is the stem)";
+                stages.map(Self::of).ok_or_else(|| format!("found {list:?}, {expected}"))
+            }
         }
     }
 }

@@ -69,7 +69,7 @@ impl Target {
         }
         if Path::new(name).extension().is_none_or(|e| e != "toml") {
             let names: Vec<&str> = BUILT_IN.iter().map(|b| b.0).collect();
-            return Err(Error::new(ErrorCode::Usage, "target", format!("unknown target '{name}'"))
+            return Err(Error::new(ErrorCode::Usage, "--target", format!("unknown target '{name}'"))
                 .with_help(format!("use one of {}, or a file FILE.toml", names.join(", "))));
         }
         let text = std::fs::read_to_string(name).map_err(|e| Error::io(Path::new(name), &e))?;
@@ -160,7 +160,7 @@ pub fn parse_size(text: &str) -> Result<u64> {
     let plain = !digits.is_empty() && digits.bytes().all(|b| b.is_ascii_digit());
     let value = digits.parse::<u64>().ok().filter(|_| plain).and_then(|n| n.checked_mul(unit));
     value.ok_or_else(|| {
-        Error::new(ErrorCode::Usage, "size", format!("found '{text}', expected a number of bytes"))
+        Error::new(ErrorCode::Usage, "", format!("found '{text}', expected a number of bytes"))
             .with_help("for example 524288, 512K or 2M")
     })
 }

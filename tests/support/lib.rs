@@ -2,6 +2,7 @@
 
 pub mod build;
 pub mod bundle;
+pub mod commands;
 pub mod every_step;
 pub mod golden;
 pub mod mutation;

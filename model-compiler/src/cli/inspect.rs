@@ -2,25 +2,29 @@
 
 use crate::artifact::{self, hex};
 use crate::emit::AlignedBytes;
-use crate::error::{Error, ErrorCode, Result};
+use crate::error::{Error, Result};
 use crate::import::checkpoint;
 use crate::import::{NamedTensors, System};
 use crate::qmodel::QModel;
+use crate::record::Record;
 use comfy_table::{CellAlignment, Table, presets};
 use firmware::image::{Image, SectionKind, layout};
 use firmware::tensor::ElementType;
+use std::fmt::Write as _;
 use std::path::Path;
 
-/// Prints what a file holds; the kind is told from its content.
+/// What a file holds, for people; the kind is told from its content.
 ///
 /// # Errors
 /// Unreadable or damaged file.
-pub fn inspect(path: &Path) -> Result<()> {
+pub fn inspect(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).map_err(|e| Error::io(path, &e))?;
     let result = if bytes.starts_with(&layout::MAGIC) {
         image(&bytes)
     } else if artifact::is::<QModel>(&bytes) {
         artifact::from_bytes(&bytes).map(|model| qmodel(&model))
+    } else if artifact::is::<Record>(&bytes) {
+        artifact::from_bytes(&bytes).map(|record| build_record(&record))
     } else {
         checkpoint::parse(&bytes).map(|checkpoint| tensors(&checkpoint))
     };
@@ -46,25 +50,25 @@ fn element_name(element: ElementType) -> &'static str {
     }
 }
 
-fn image(bytes: &[u8]) -> Result<()> {
+fn image(bytes: &[u8]) -> Result<String> {
+    let mut text = String::new();
     let aligned = AlignedBytes::from(bytes);
-    let malformed = |message: String| Error::new(ErrorCode::Malformed, "", message);
-    let image = Image::parse(&aligned).map_err(|e| malformed(e.to_string()))?;
-    println!("model image  {}", image.name());
-    println!("sha256       {}", hex(&artifact::sha256(bytes)));
-    println!("qmodel       {}", hex(&image.qmodel_digest()));
-    println!("bytes        {}", bytes.len());
-    println!("arena        {} B, aligned to {}", image.arena_bytes(), image.arena_alignment());
-    println!("steps        {}", image.step_count());
-    let check = image.check().map_or_else(|e| e.to_string(), |()| "all section CRCs match".into());
-    println!("check        {check}\n");
+    let image = Image::parse(&aligned)?;
+    image.check()?;
+    let _ = writeln!(text, "model image  {}", image.name());
+    let _ = writeln!(text, "sha256       {}", hex(&artifact::sha256(bytes)));
+    let _ = writeln!(text, "qmodel       {}", hex(&image.qmodel_digest()));
+    let _ = writeln!(text, "bytes        {}", bytes.len());
+    let _ = writeln!(text, "arena        {} B, aligned to {}", image.arena_bytes(), image.arena_alignment());
+    let _ = writeln!(text, "steps        {}", image.step_count());
+    let _ = writeln!(text, "check        all section CRCs match\n");
 
     let mut sections = table(&["section", "bytes", "crc32"], 1);
     for kind in SectionKind::ALL {
         let length = image.section(kind).len().to_string();
         sections.add_row([kind.name().to_owned(), length, format!("{:08x}", image.section_crc(kind))]);
     }
-    println!("{sections}\n");
+    let _ = writeln!(text, "{sections}\n");
 
     let mut ports = table(&["port", "name", "type", "shape", "scale", "zero point"], 4);
     let inputs = (0..image.input_count()).filter_map(|i| Some(("input", image.input(i)?)));
@@ -75,7 +79,7 @@ fn image(bytes: &[u8]) -> Result<()> {
         let (scale, zero_point) = (port.scale.to_string(), port.zero_point.to_string());
         ports.add_row([direction, port.name, element_name(record.element), &shape, &scale, &zero_point]);
     }
-    println!("{ports}\n");
+    let _ = writeln!(text, "{ports}\n");
 
     let records: Vec<_> =
         (0..image.tensor_count()).filter_map(|i| image.tensor(firmware::tensor::TensorId(i))).collect();
@@ -96,10 +100,10 @@ fn image(bytes: &[u8]) -> Result<()> {
             live.to_string(),
         ]);
     }
-    println!("{steps}");
+    let _ = writeln!(text, "{steps}");
     let bound = (0..image.step_count()).map(|p| live_bytes(&records, p)).max().unwrap_or(0);
-    println!("\narena {} B, largest live sum {bound} B", image.arena_bytes());
-    Ok(())
+    let _ = writeln!(text, "\narena {} B, largest live sum {bound} B", image.arena_bytes());
+    Ok(text)
 }
 
 /// Arena bytes that hold something at a step: the union of the live buffers (buffers that share memory count once).
@@ -115,12 +119,13 @@ fn live_bytes(records: &[firmware::image::TensorRecord], position: u16) -> u64 {
     sum
 }
 
-fn qmodel(model: &QModel) {
-    println!("quantized model  {} ({})", model.name, model.system);
+fn qmodel(model: &QModel) -> String {
+    let mut text = String::new();
+    let _ = writeln!(text, "quantized model  {} ({})", model.name, model.system);
     for (key, value) in &model.provenance {
-        println!("{key:>20}  {value}");
+        let _ = writeln!(text, "{key:>20}  {value}");
     }
-    println!();
+    let _ = writeln!(text);
     let mut steps = table(&["step", "op", "type", "shape", "scale", "zero point", "headroom bits", "weight bytes"], 3);
     for step in &model.steps {
         let output = model.tensor(step.op.output());
@@ -135,24 +140,36 @@ fn qmodel(model: &QModel) {
             step.op.weight_bytes().to_string(),
         ]);
     }
-    println!("{steps}");
+    let _ = writeln!(text, "{steps}");
+    text
 }
 
-fn tensors(checkpoint: &checkpoint::Checkpoint) {
+fn build_record(record: &Record) -> String {
+    let mut text = String::new();
+    let _ = writeln!(text, "build record     image {}", hex(&record.image_sha256));
+    let _ = writeln!(text, "target           {}", record.target);
+    let (arena, bound) = (record.plan.arena_bytes, record.plan.bound_bytes);
+    let _ = writeln!(text, "arena            {arena} B, bound {bound} B: {}\n", record.plan.status.words());
+    text + &qmodel(&record.model)
+}
+
+fn tensors(checkpoint: &checkpoint::Checkpoint) -> String {
+    let mut text = String::new();
     let named = NamedTensors::from(checkpoint.clone());
     let system = System::detect(&named).map_or("not recognized", System::name);
     let values: usize = checkpoint.tensors().iter().map(|t| t.shape.iter().product::<usize>()).sum();
-    println!("checkpoint  {}", checkpoint.format().name());
-    println!("system      {system}");
-    println!("sha256      {}", hex(checkpoint.sha256()));
-    println!("tensors     {}, {values} values\n", checkpoint.tensors().len());
+    let _ = writeln!(text, "checkpoint  {}", checkpoint.format().name());
+    let _ = writeln!(text, "system      {system}");
+    let _ = writeln!(text, "sha256      {}", hex(checkpoint.sha256()));
+    let _ = writeln!(text, "tensors     {}, {values} values\n", checkpoint.tensors().len());
     let mut rows = table(&["tensor", "type", "shape", "values"], 2);
     for tensor in checkpoint.tensors() {
         let count = tensor.shape.iter().product::<usize>().to_string();
         rows.add_row([tensor.name.clone(), format!("{:?}", tensor.dtype), format!("{:?}", tensor.shape), count]);
     }
-    println!("{rows}");
+    let _ = writeln!(text, "{rows}");
     if !checkpoint.skipped().is_empty() {
-        println!("\nnot tensors, skipped: {}", checkpoint.skipped().join(", "));
+        let _ = writeln!(text, "\nnot tensors, skipped: {}", checkpoint.skipped().join(", "));
     }
+    text
 }

@@ -12,8 +12,11 @@ use std::path::Path;
 pub fn load(path: &Path, shape: Shape) -> Result<ByteMap> {
     let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format);
     let decoded = reader.map_err(|e| Error::io(path, &e))?.decode();
-    let image =
-        decoded.map_err(|e| Error::new(ErrorCode::Frames, path.display().to_string(), e.to_string()))?.into_rgb8();
+    let refuse = |e: image::ImageError| {
+        Error::new(ErrorCode::Frames, path.display().to_string(), format!("no readable image: {e}"))
+            .with_help("expected a whole PNG or JPEG file; copy or save it again")
+    };
+    let image = decoded.map_err(refuse)?.into_rgb8();
     let (width, height) = image.dimensions();
     let full = FullImage { height: height as usize, width: width as usize, rgb: image.as_raw() };
     center_crop(&full, shape).map_err(|e| e.within(path.display()))

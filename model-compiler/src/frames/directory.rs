@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 const IMAGE: &str = "rgb.png";
 const LIDAR: &str = "lidar.bin";
 const DESCRIPTION: &str = "frame.json";
+const DESCRIPTION_HELP: &str =
+    r#"expected {"speed": m/s, "goal": [right_m, forward_m]}, optionally "command", "lidar_axes", "lidar_height_m""#;
 /// x, y, z, intensity as little-endian f32.
 const POINT_BYTES: usize = 16;
 
@@ -88,8 +90,13 @@ struct Description {
 impl Description {
     fn read(path: &Path) -> Result<Self> {
         let text = std::fs::read_to_string(path).map_err(|e| Error::io(path, &e))?;
-        let json = serde_json::from_str(&text)
-            .map_err(|e| Error::new(ErrorCode::Frames, path.display().to_string(), format!("not JSON: {e}")))?;
+        let refuse = |message: String| {
+            Error::new(ErrorCode::Frames, path.display().to_string(), message).with_help(DESCRIPTION_HELP)
+        };
+        let json: Value = serde_json::from_str(&text).map_err(|e| refuse(format!("not JSON: {e}")))?;
+        if !json.is_object() {
+            return Err(refuse("found no JSON object".into()));
+        }
         Ok(Self { path: path.to_path_buf(), json })
     }
 
@@ -138,6 +145,7 @@ impl Description {
             self.path.display().to_string(),
             format!("`{field}`: {found}, expected {expected}"),
         )
+        .with_help(DESCRIPTION_HELP)
     }
 }
 

@@ -12,6 +12,7 @@ pub(super) fn load(path: &Path, format: &FrameFormat) -> Result<Vec<Frame>> {
     let bytes = std::fs::read(path).map_err(|e| Error::io(path, &e))?;
     let file = SafeTensors::deserialize(&bytes).map_err(|e| {
         Error::new(ErrorCode::Malformed, path.display().to_string(), format!("not a safetensors file: {e}"))
+            .with_help("frames are a frame directory or a .safetensors file of raw network inputs")
     })?;
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
     frames(&file, &stem, format).map_err(|e| e.within(path.display()))
@@ -52,10 +53,8 @@ struct Batch<'a> {
 impl Batch<'_> {
     fn tensor(&mut self, name: &str, element: Dtype, per_frame: &[usize]) -> Result<TensorView<'_>> {
         let Ok(view) = self.file.tensor(name) else {
-            let held = self.file.names().join(", ");
-            return Err(
-                tensor_error(name, "missing; this network needs it").with_help(format!("the file holds: {held}"))
-            );
+            let error = tensor_error(name, "missing; this network needs it");
+            return Err(error.with_help(format!("the file holds: {}", self.held())));
         };
         let fits = view.shape().split_first().filter(|(_, rest)| *rest == per_frame && view.dtype() == element);
         let frames = fits.map(|(&frames, _)| frames).filter(|&n| self.frames.is_none_or(|known| known == n));
@@ -66,11 +65,26 @@ impl Batch<'_> {
         Ok(view)
     }
 
+    /// Names in the file, the first few of them.
+    fn held(&self) -> String {
+        const SHOWN: usize = 8;
+        let mut names = self.file.names();
+        names.sort_unstable();
+        let more = names.len().saturating_sub(SHOWN);
+        names.truncate(SHOWN);
+        let rest = if more > 0 { format!(" and {more} more") } else { String::new() };
+        names.join(", ") + &rest
+    }
+
     fn mismatch(&self, name: &str, view: &TensorView<'_>, element: Dtype, per_frame: &[usize]) -> Error {
         let frames = self.frames.map_or("N".to_owned(), |n| n.to_string());
         let expected: Vec<String> = std::iter::once(frames).chain(per_frame.iter().map(usize::to_string)).collect();
         let message = format!("{:?} {:?}, expected {element:?} [{}]", view.dtype(), view.shape(), expected.join(", "));
-        tensor_error(name, message)
+        let help = match per_frame {
+            [_, _, _] => "--resolution HxW sets the size of a network whose checkpoint does not tell it",
+            _ => "",
+        };
+        tensor_error(name, message).with_help(help)
     }
 
     /// `[N][C][H][W]` to a channel-fastest map per frame.

@@ -96,7 +96,8 @@ impl Transformer {
         let key = b.linear(&name("attn.key"), x, self.channels)?;
         let value = b.linear(&name("attn.value"), x, self.channels)?;
         let attention = Op::Attention { heads: b.options.heads };
-        let context = b.push(name("attn.context"), attention, &[query, key, value])?;
+        let context = b.push(name("attn.context"), attention, &[query, key, value]);
+        let context = context.map_err(|e| e.with_help("--heads sets the number of heads"))?;
         let branch = b.linear(&name("attn.proj"), context, self.channels)?;
         let stream = b.push(name("attn.add"), Op::Add { relu: false }, &[branch, stream])?;
 
