@@ -193,7 +193,7 @@ impl Edit {
 }
 
 /// Checks that no image needs alone, with the reason.
-const SECOND_OPINIONS: [(Check, &str); 5] = [
+const SECOND_OPINIONS: [(Check, &str); 4] = [
     (
         Check::HeaderLength,
         "what a shorter file lacks reads as zero, which the next checks refuse; the message is better",
@@ -203,7 +203,6 @@ const SECOND_OPINIONS: [(Check, &str); 5] = [
         "an unknown bit also differs from what the program uses; named first, it says that a runtime is old",
     ),
     (Check::TensorLive, "a false range is also one whose first step does not write or whose last step does not read"),
-    (Check::StepTensor, "cannot be switched off: without a record there is nothing to go on with"),
     (Check::StepReadsScratch, "scratch is live in its own step only, so reading it also reads what holds nothing"),
 ];
 

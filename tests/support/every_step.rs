@@ -3,10 +3,7 @@
 
 use crate::build;
 use crate::random::Random;
-use firmware::engine::Engine;
-use firmware::image::known_answer::Generator;
-use firmware::image::{Image, crc32};
-use firmware::kernels::Portable;
+use firmware::image::Image;
 use firmware::program::Window;
 use firmware::tensor::Shape;
 use model_compiler::emit::{AlignedBytes, ImageParts, KnownAnswer};
@@ -19,7 +16,7 @@ use model_compiler::pipeline::{self, Compiled};
 use model_compiler::quantize::{QuantizeOptions, SkipStages};
 use std::sync::Arc;
 
-/// Seed of weights, frames and the known answer.
+/// Seed of weights and frames.
 pub const SEED: u64 = 2026;
 
 /// Channels of both branches and of the transformer.
@@ -107,30 +104,14 @@ pub fn compiled() -> Compiled {
 pub fn parts() -> ImageParts {
     let compiled = compiled();
     let mut parts = pack(&compiled.record.model, &compiled.record.plan).unwrap_or_else(|e| panic!("{e}"));
-    parts.known_answer = Some(known_answer(&compiled.image, SEED));
+    parts.known_answer = Image::parse(&AlignedBytes::from(compiled.image.as_slice())).ok().and_then(stored_answer);
     parts
 }
 
-/// What the portable engine gives for the seeded inputs of an image.
-///
-/// # Panics
-/// The image is refused.
-pub fn known_answer(image: &[u8], seed: u64) -> KnownAnswer {
-    let image = AlignedBytes::from(image);
-    let image = Image::parse(&image).unwrap_or_else(|e| panic!("{e}"));
-    let mut generator = Generator::new(seed);
-    let inputs = (0..image.input_count()).filter_map(|i| image.tensor(image.input(i)?.tensor)).map(|record| {
-        let mut bytes = vec![0; record.bytes as usize];
-        generator.fill(record.element, &mut bytes);
-        bytes
-    });
-    let inputs: Vec<Vec<u8>> = inputs.collect();
-    let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
-    let mut arena = AlignedBytes::zeroed(image.arena_bytes() as usize);
-    let mut step_crcs = Vec::new();
-    let mut engine = Engine::new(image, Portable, &mut arena).unwrap_or_else(|e| panic!("{e}"));
-    engine.infer_observed(&inputs, |_, _, bytes| step_crcs.push(crc32(bytes))).unwrap_or_else(|e| panic!("{e}"));
-    KnownAnswer { seed, step_crcs }
+fn stored_answer(image: Image<'_>) -> Option<KnownAnswer> {
+    let answer = image.known_answer()?;
+    let step_crcs = (0..image.step_count()).map(|position| answer.step_crc(position)).collect::<Option<_>>()?;
+    Some(KnownAnswer { seed: answer.seed(), step_crcs })
 }
 
 struct Builder {
@@ -255,6 +236,8 @@ fn window(kernel: u8, stride: u8, pad: u8) -> Window {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use firmware::engine::Engine;
+    use firmware::kernels::Portable;
     use firmware::program::{Residual, Step};
     use model_compiler::emit::emit;
 
