@@ -185,7 +185,7 @@ impl<'a> Auditor<'_, 'a> {
             if wide {
                 continue;
             }
-            if bound > i32::MAX.unsigned_abs().into() {
+            if bound > u64::from(i32::MAX.unsigned_abs()) {
                 return Err(AuditError::Accumulator { step: self.position, channel, bound });
             }
             result.accumulator_bits = result.accumulator_bits.max(u64::BITS.saturating_sub(bound.leading_zeros()));

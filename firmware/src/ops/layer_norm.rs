@@ -18,7 +18,7 @@ pub(super) fn validate(step: &LayerNorm, context: &StepContext<'_, '_>) -> Resul
     context.ensure_within(Check::StepChannels, input.channels, 1..=MAX_CHANNELS)?;
     let last = u64::from(step.first_row).saturating_add(output.positions().into());
     let rows = input.positions();
-    context.ensure(Check::StepRows, last <= rows.into(), i64::try_from(last).unwrap_or(i64::MAX), rows)?;
+    context.ensure(Check::StepRows, last <= u64::from(rows), i64::try_from(last).unwrap_or(i64::MAX), rows)?;
     context.ensure_within(Check::StepEpsilon, step.epsilon, 1..=MAX_EPSILON)?;
     context.constants::<i32>(step.gains, input.channels.into())?;
     context.constants::<i64>(step.offsets, input.channels.into())?;
