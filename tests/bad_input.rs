@@ -463,7 +463,8 @@ fn quantized_models_that_contradict_themselves() {
     let folder = project(System::Aim);
     let good: QModel = artifact::from_bytes(&folder.read("net.qmodel")).unwrap();
     let steps = good.steps.len();
-    let damages: [(&str, fn(&mut QModel)); 4] = [
+    type Damage = fn(&mut QModel);
+    let damages: [(&str, Damage); 4] = [
         ("a step is missing", |m| drop(m.steps.remove(2))),
         ("a step is there twice", |m| m.steps.push(m.steps[1].clone())),
         ("a tensor has another shape", |m| m.tensors[2].shape.height += 1),
