@@ -380,23 +380,23 @@ fn frames_known_from_calibration_are_said_loudly() {
 #[test]
 fn models_too_big_for_the_target() {
     let folder = project(System::Aim);
+    let bytes = folder.read("net.img").len();
+    let flash = |target: &str, limit: usize| {
+        let over = bytes - limit;
+        format!(
+            "@net.qmodel: target {target}: the image needs {bytes} bytes, {limit} are there: {over} too many\n  help: \
+             use a target with more flash (--flash), or a smaller network"
+        )
+    };
     refused(
         &folder,
         "model-compiler compile @net.qmodel --ram 8K -o @new.img",
         "@net.qmodel: target portable: the arena needs 328876 bytes, 8192 are there: 320684 too many\nat the peak, step 0 (image_encoder.features.relu), these are live:\n  rgb                              196608\n  image_encoder.features.relu      131072\n  scratch                            1176\n  goal                                  8\n  help: use a target with more RAM (--ram), or a smaller network; no plan for this order is smaller",
     );
-    refused(
-        &folder,
-        "model-compiler compile @net.qmodel --flash 32K -o @new.img",
-        "@net.qmodel: target portable: the image needs 43808 bytes, 32768 are there: 11040 too many\n  help: use a target with more flash (--flash), or a smaller network",
-    );
+    refused(&folder, "model-compiler compile @net.qmodel --flash 32K -o @new.img", &flash("portable", 32768));
     folder.write("tiny.toml", "name = 'tiny'\nalignment = 4\nflash = '1K'\n[[regions]]\nname = 'main'\n");
     let tiny = folder.path("tiny.toml").display().to_string();
-    refused(
-        &folder,
-        &format!("model-compiler compile @net.qmodel --target {tiny} -o @new.img"),
-        "@net.qmodel: target tiny: the image needs 43808 bytes, 1024 are there: 42784 too many\n  help: use a target with more flash (--flash), or a smaller network",
-    );
+    refused(&folder, &format!("model-compiler compile @net.qmodel --target {tiny} -o @new.img"), &flash("tiny", 1024));
 }
 
 #[test]
@@ -463,7 +463,8 @@ fn quantized_models_that_contradict_themselves() {
     let folder = project(System::Aim);
     let good: QModel = artifact::from_bytes(&folder.read("net.qmodel")).unwrap();
     let steps = good.steps.len();
-    let damages: [(&str, fn(&mut QModel)); 4] = [
+    type Damage = fn(&mut QModel);
+    let damages: [(&str, Damage); 4] = [
         ("a step is missing", |m| drop(m.steps.remove(2))),
         ("a step is there twice", |m| m.steps.push(m.steps[1].clone())),
         ("a tensor has another shape", |m| m.tensors[2].shape.height += 1),
