@@ -261,7 +261,8 @@ fn unfitting_options_are_refused_by_name() {
     let error = import("m", tensors.clone(), &heads).unwrap_err();
     assert_eq!(
         error.to_string(),
-        "m: attention encoder.transformer1.blocks.0.attn.context: 8 channels are not divisible by 3 heads"
+        "m: attention encoder.transformer1.blocks.0.attn.context: 8 channels are not divisible by 3 heads\n  \
+         help: --heads sets the number of heads"
     );
     let resolution = ImportOptions { resolution: Some((128, 64)), ..Default::default() };
     let error = import("m", tensors.clone(), &resolution).unwrap_err();

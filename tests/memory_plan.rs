@@ -230,18 +230,7 @@ impl Builder {
 
 fn window(kernel: u8, stride: u8) -> Window {
     let pad = kernel / 2;
-    Window {
-        kernel_h: kernel,
-        kernel_w: kernel,
-        stride_h: stride,
-        stride_w: stride,
-        pad_top: pad,
-        pad_bottom: pad,
-        pad_left: pad,
-        pad_right: pad,
-        dilation_h: 1,
-        dilation_w: 1,
-    }
+    Window::square(kernel, stride, pad)
 }
 
 fn rescale(residual: QResidual) -> QRescale {

@@ -73,6 +73,22 @@ pub struct Window {
 }
 
 impl Window {
+    /// A square kernel with the same stride in both directions and the same padding on all sides, dilation 1.
+    pub const fn square(kernel: u8, stride: u8, padding: u8) -> Self {
+        Self {
+            kernel_h: kernel,
+            kernel_w: kernel,
+            stride_h: stride,
+            stride_w: stride,
+            pad_top: padding,
+            pad_bottom: padding,
+            pad_left: padding,
+            pad_right: padding,
+            dilation_h: 1,
+            dilation_w: 1,
+        }
+    }
+
     /// Output height and width over an input of `height × width`, or `None` where the window does not fit or a field
     /// is zero: `out = (in + pads − dilation·(kernel − 1) − 1) / stride + 1`.
     pub fn output_size(&self, height: u16, width: u16) -> Option<(u16, u16)> {

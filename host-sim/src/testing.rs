@@ -14,18 +14,7 @@ use model_compiler::record::Record;
 const CAMERA: Shape = Shape::map(4, 4, 3);
 const POOLED: Shape = Shape::map(2, 2, 3);
 const MEAN: Shape = Shape::vector(3);
-const HALVE: Window = Window {
-    kernel_h: 2,
-    kernel_w: 2,
-    stride_h: 2,
-    stride_w: 2,
-    pad_top: 0,
-    pad_bottom: 0,
-    pad_left: 0,
-    pad_right: 0,
-    dilation_h: 1,
-    dilation_w: 1,
-};
+const HALVE: Window = Window::square(2, 2, 0);
 /// 1/64 per code: an average of four values is exact.
 const MEAN_SCALE: f64 = 1.0 / 64.0;
 /// `1 / (MEAN_SCALE·4) = 16`.

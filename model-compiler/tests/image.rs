@@ -174,7 +174,7 @@ fn audit_refuses_overflow_and_bad_constants() {
     let edit = |parts: &ImageParts, at: u32, value: &[u8]| {
         let mut parts = parts.clone();
         parts.constants[at as usize..at as usize + value.len()].copy_from_slice(value);
-        let bytes = AlignedBytes::from(emit(&parts).expect("parse reads no constants").as_slice());
+        let bytes = AlignedBytes::from(assemble(&parts).expect("fits the format").as_slice());
         audit(&Image::parse(&bytes).expect("parses")).expect_err("must be refused")
     };
     let error = edit(&parts, rescale.bias.offset + 4, &i32::MAX.to_le_bytes());

@@ -448,18 +448,7 @@ fn endless_convolution() -> ImageParts {
     let mut parts = attention_alone(8, 8, 2);
     let side = 32_767_u16;
     let shape = Shape::map(side, side, 1);
-    let window = Window {
-        kernel_h: 255,
-        kernel_w: 255,
-        stride_h: 1,
-        stride_w: 1,
-        pad_top: 127,
-        pad_bottom: 127,
-        pad_left: 127,
-        pad_right: 127,
-        dilation_h: 1,
-        dilation_w: 1,
-    };
+    let window = Window::square(255, 1, 127);
     let scratch = plan::conv2d_scratch_bytes(KernelId::Direct, shape, shape, window, 1);
     let map = 1 << 30;
     let tensor = |offset| TensorRecord { shape, offset, bytes: shape.elements() as u32, ..parts.tensors[0] };

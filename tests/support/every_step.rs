@@ -51,8 +51,8 @@ pub fn graph() -> Graph {
     let velocity = b.graph.push_input("velocity", InputKind::Velocity, Shape::vector(1));
     let goal = b.graph.push_input("goal", InputKind::Goal, Shape::vector(2));
     let image = b.image_branch(rgb);
-    let stem = b.conv("lidar.stem", &[bev], window(3, 2, 1), 1, None, true);
-    let lidar = b.push("lidar.pool", Op::AveragePool(window(2, 2, 0)), &[stem]);
+    let stem = b.conv("lidar.stem", &[bev], Window::square(3, 2, 1), 1, None, true);
+    let lidar = b.push("lidar.pool", Op::AveragePool(Window::square(2, 2, 0)), &[stem]);
     let [image_tokens, lidar_tokens] = b.transformer(image, lidar, velocity);
     let enlarged = Op::ResizeBilinear { factor: (2, 2) };
     let image = b.push("image.fused", enlarged.clone(), &[image_tokens, image]);
@@ -180,10 +180,10 @@ impl Builder {
     /// Strided stem, padded max pool, a residual block with a grouped convolution.
     fn image_branch(&mut self, rgb: ValueId) -> ValueId {
         let normalization = Normalization { mean: vec![124.0, 116.0, 104.0], std: vec![58.0, 57.0, 57.5] };
-        let stem = self.conv("image.stem", &[rgb], window(3, 2, 1), 1, Some(normalization), false);
-        let pooled = self.push("image.pool", Op::MaxPool(window(3, 2, 1)), &[stem]);
-        let grouped = self.conv("image.conv1", &[pooled], window(3, 1, 1), 2, None, true);
-        self.conv("image.conv2", &[grouped, pooled], window(3, 1, 1), 1, None, true)
+        let stem = self.conv("image.stem", &[rgb], Window::square(3, 2, 1), 1, Some(normalization), false);
+        let pooled = self.push("image.pool", Op::MaxPool(Window::square(3, 2, 1)), &[stem]);
+        let grouped = self.conv("image.conv1", &[pooled], Window::square(3, 1, 1), 2, None, true);
+        self.conv("image.conv2", &[grouped, pooled], Window::square(3, 1, 1), 1, None, true)
     }
 
     /// One layer over four tokens of each branch; returns the normalized maps of both.
@@ -215,21 +215,6 @@ impl Builder {
             output_bias: self.bias(2),
             steps: 4,
         })
-    }
-}
-
-fn window(kernel: u8, stride: u8, pad: u8) -> Window {
-    Window {
-        kernel_h: kernel,
-        kernel_w: kernel,
-        stride_h: stride,
-        stride_w: stride,
-        pad_top: pad,
-        pad_bottom: pad,
-        pad_left: pad,
-        pad_right: pad,
-        dilation_h: 1,
-        dilation_w: 1,
     }
 }
 

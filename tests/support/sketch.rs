@@ -185,18 +185,7 @@ fn chain(steps: usize, step: fn(&mut Sketch, TensorId) -> TensorId) -> ImagePart
 }
 
 fn window(kernel: u8, stride: u8) -> Window {
-    Window {
-        kernel_h: kernel,
-        kernel_w: kernel,
-        stride_h: stride,
-        stride_w: stride,
-        pad_top: 0,
-        pad_bottom: 0,
-        pad_left: 0,
-        pad_right: 0,
-        dilation_h: 1,
-        dilation_w: 1,
-    }
+    Window::square(kernel, stride, 0)
 }
 
 fn sealed(parts: &ImageParts) -> Vec<u8> {

@@ -137,18 +137,7 @@ mod tests {
 
     #[test]
     fn transfusers_stem_pool_may_run_in_place() {
-        let window = Window {
-            kernel_h: 3,
-            kernel_w: 3,
-            stride_h: 2,
-            stride_w: 2,
-            pad_top: 1,
-            pad_bottom: 1,
-            pad_left: 1,
-            pad_right: 1,
-            dilation_h: 1,
-            dilation_w: 1,
-        };
+        let window = Window::square(3, 2, 1);
         assert!(max_pool_in_place(Shape::map(128, 128, 64), Shape::map(64, 64, 64), window));
         assert!(!max_pool_in_place(Shape::map(128, 128, 64), Shape::map(64, 64, 32), window), "channels differ");
     }

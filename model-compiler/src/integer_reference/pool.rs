@@ -102,7 +102,7 @@ fn fold_windows(
 #[cfg(test)]
 mod tests {
     use crate::error::ErrorCode;
-    use crate::integer_reference::testing::{Random, clamp, execute_alone, rounding_shift, window};
+    use crate::integer_reference::testing::{Random, clamp, execute_alone, rounding_shift};
     use crate::qmodel::{QOp, QTensorId, QTerm};
     use firmware::program::{Requant, Window};
     use firmware::tensor::{ElementType, Shape};
@@ -117,9 +117,9 @@ mod tests {
     fn padding_never_wins_a_max_pool() {
         let codes = [-128.0, 5.0, -127.0, -9.0, -126.0, -9.0];
         let shape = Shape::map(1, 3, 2);
-        let pooled = max_pool(window(3, 2, 1), shape, &codes, Shape::map(1, 2, 2));
+        let pooled = max_pool(Window::square(3, 2, 1), shape, &codes, Shape::map(1, 2, 2));
         assert_eq!(pooled, Ok(vec![-127.0, 5.0, -126.0, -9.0]));
-        let only_padding = Window { kernel_h: 1, kernel_w: 1, ..window(1, 1, 1) };
+        let only_padding = Window { kernel_h: 1, kernel_w: 1, ..Window::square(1, 1, 1) };
         assert_eq!(max_pool(only_padding, shape, &codes, Shape::map(3, 5, 2)), Err(ErrorCode::Malformed));
     }
 
@@ -129,7 +129,7 @@ mod tests {
             let op = QOp::AveragePool {
                 input: QTensorId(0),
                 output: QTensorId(1),
-                window: window(2, 2, 0),
+                window: Window::square(2, 2, 0),
                 input_zero_point: 10,
                 requant: Requant { multiplier: 1 << 23, shift: 25 },
                 zero_point: -3,

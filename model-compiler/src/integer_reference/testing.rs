@@ -4,7 +4,7 @@ use super::execute;
 use crate::error::Result;
 use crate::ir::InputKind;
 use crate::qmodel::{Bounds, Port, QModel, QOp, QRescale, QResidual, QStep, QTensor, QTensorId};
-use firmware::program::{Clamp, Requant, Window};
+use firmware::program::{Clamp, Requant};
 use firmware::tensor::{ElementType, Shape};
 
 /// A model of tensors alone: scale 1, zero point 0.
@@ -39,22 +39,6 @@ pub fn port(name: &str, tensor: u32, kind: Option<InputKind>) -> Port {
 
 pub fn clamp(min: i16, max: i16) -> Clamp {
     Clamp { min, max }
-}
-
-/// A kernel of `size × size` with this stride and padding on all sides.
-pub fn window(size: u8, stride: u8, pad: u8) -> Window {
-    Window {
-        kernel_h: size,
-        kernel_w: size,
-        stride_h: stride,
-        stride_w: stride,
-        pad_top: pad,
-        pad_bottom: pad,
-        pad_left: pad,
-        pad_right: pad,
-        dilation_h: 1,
-        dilation_w: 1,
-    }
 }
 
 /// One operator over tensors 0, 1, … with these shapes, types and codes; the output is the last, without codes.

@@ -189,7 +189,7 @@ pub(super) fn check_window(window: &Window, shape: Shape, output: Shape) -> Resu
 #[cfg(test)]
 mod tests {
     use crate::error::ErrorCode;
-    use crate::integer_reference::testing::{Random, clamp, execute_alone, rescale_code, window};
+    use crate::integer_reference::testing::{Random, clamp, execute_alone, rescale_code};
     use crate::qmodel::{QOp, QRescale, QResidual, QTensorId};
     use firmware::program::Window;
     use firmware::tensor::{ElementType, Shape};
@@ -240,7 +240,7 @@ mod tests {
         let op = QOp::Conv2d {
             input: INPUT,
             output: QTensorId(1),
-            window: Window { pad_bottom: 0, pad_right: 0, ..window(2, 1, 1) },
+            window: Window { pad_bottom: 0, pad_right: 0, ..Window::square(2, 1, 1) },
             groups: 1,
             weights: vec![1; 8],
             padding_codes: vec![-4, 30],
@@ -416,7 +416,7 @@ mod tests {
             let op = QOp::Conv2d {
                 input: INPUT,
                 output: QTensorId(1),
-                window: window(3, 1, 1),
+                window: Window::square(3, 1, 1),
                 groups: 1,
                 weights: vec![1; weights],
                 padding_codes: vec![0; 2],

@@ -16,18 +16,7 @@ pub(super) fn conv(graph: &mut Graph, name: &str, input: ValueId, outputs: usize
     let channels = usize::from(graph.value(input).shape.channels);
     let data = (1..=outputs * channels).map(|v| v as f32).collect();
     let weights = Arc::new(Weights { shape: vec![outputs, 1, 1, channels], data });
-    let window = Window {
-        kernel_h: 1,
-        kernel_w: 1,
-        stride_h: 1,
-        stride_w: 1,
-        pad_top: 0,
-        pad_bottom: 0,
-        pad_left: 0,
-        pad_right: 0,
-        dilation_h: 1,
-        dilation_w: 1,
-    };
+    let window = Window::square(1, 1, 0);
     let op = Conv2d { weights, bias: None, window, groups: 1, normalization: None, relu: false };
     graph.push(name, Op::Conv2d(op), &[input]).unwrap()
 }

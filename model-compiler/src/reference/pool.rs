@@ -77,18 +77,7 @@ mod tests {
     use super::super::testing::{assert_close, values};
     use super::*;
 
-    const POOL_3X3_STRIDE_2: Window = Window {
-        kernel_h: 3,
-        kernel_w: 3,
-        stride_h: 2,
-        stride_w: 2,
-        pad_top: 1,
-        pad_bottom: 1,
-        pad_left: 1,
-        pad_right: 1,
-        dilation_h: 1,
-        dilation_w: 1,
-    };
+    const POOL_3X3_STRIDE_2: Window = Window::square(3, 2, 1);
 
     /// The values under a window, straight from the definition.
     fn under(w: &Window, shape: Shape, map: &[f32], oy: i32, ox: i32, c: usize) -> Vec<f64> {

@@ -117,21 +117,6 @@ fn clamp(element: ElementType) -> Clamp {
     Clamp { min: *codes.start(), max: *codes.end() }
 }
 
-fn window(kernel: u8, stride: u8, pad: u8) -> Window {
-    Window {
-        kernel_h: kernel,
-        kernel_w: kernel,
-        stride_h: stride,
-        stride_w: stride,
-        pad_top: pad,
-        pad_bottom: pad,
-        pad_left: pad,
-        pad_right: pad,
-        dilation_h: 1,
-        dilation_w: 1,
-    }
-}
-
 fn requant() -> Requant {
     Requant { multiplier: 12_345_678, shift: 24 }
 }
@@ -200,9 +185,13 @@ fn shapes() -> Vec<(Shape, ElementType)> {
 
 fn steps(n: &mut Numbers) -> Vec<Step> {
     vec![
-        conv(n, (ids::RGB, 3), (ids::STEM, 8, I8), window(3, 1, 1), 1, Residual::None),
-        Step::MaxPool(MaxPool { input: TensorId(ids::STEM), output: TensorId(ids::POOLED), window: window(2, 2, 0) }),
-        conv(n, (ids::LIDAR, 4), (ids::LIDAR_WIDE, 8, I16), window(3, 2, 1), 2, Residual::None),
+        conv(n, (ids::RGB, 3), (ids::STEM, 8, I8), Window::square(3, 1, 1), 1, Residual::None),
+        Step::MaxPool(MaxPool {
+            input: TensorId(ids::STEM),
+            output: TensorId(ids::POOLED),
+            window: Window::square(2, 2, 0),
+        }),
+        conv(n, (ids::LIDAR, 4), (ids::LIDAR_WIDE, 8, I16), Window::square(3, 2, 1), 2, Residual::None),
         Step::Requantize(Requantize {
             input: TensorId(ids::LIDAR_WIDE),
             output: TensorId(ids::LIDAR_NARROW),
@@ -232,7 +221,7 @@ fn steps(n: &mut Numbers) -> Vec<Step> {
         Step::AveragePool(AveragePool {
             input: TensorId(ids::SUM),
             output: TensorId(ids::SMALL),
-            window: window(2, 2, 0),
+            window: Window::square(2, 2, 0),
             input_zero_point: 0,
             requant: requant(),
             zero_point: 0,
@@ -276,7 +265,7 @@ fn conv(
 fn residual_conv(n: &mut Numbers) -> Step {
     let multipliers = n.words(8, 1 << 28, 1 << 29);
     let residual = Residual::Scaled { tensor: TensorId(ids::FUSED), zero_point: 2, multipliers };
-    conv(n, (ids::SUM, 8), (ids::BLOCK, 8, I8), window(1, 1, 0), 1, residual)
+    conv(n, (ids::SUM, 8), (ids::BLOCK, 8, I8), Window::square(1, 1, 0), 1, residual)
 }
 
 fn linear(n: &mut Numbers, input: u16, output: (u16, ElementType), wide: bool, residual: Residual) -> Step {
@@ -391,7 +380,7 @@ fn in_place(shapes: &[(Shape, ElementType)]) -> Vec<(u16, u16)> {
         (ids::BLOCK, ids::FUSED),
     ];
     let [input, output] = [ids::STEM, ids::POOLED].map(|id| shapes[usize::from(id)].0);
-    if plan::max_pool_in_place(input, output, window(2, 2, 0)) {
+    if plan::max_pool_in_place(input, output, Window::square(2, 2, 0)) {
         pairs.push((ids::POOLED, ids::STEM));
     }
     pairs

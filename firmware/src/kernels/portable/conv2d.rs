@@ -248,18 +248,7 @@ mod tests {
         }
     }
 
-    const NO_PADDING: Window = Window {
-        kernel_h: 1,
-        kernel_w: 1,
-        stride_h: 1,
-        stride_w: 1,
-        pad_top: 0,
-        pad_bottom: 0,
-        pad_left: 0,
-        pad_right: 0,
-        dilation_h: 1,
-        dilation_w: 1,
-    };
+    const NO_PADDING: Window = Window::square(1, 1, 0);
 
     #[test]
     fn scratch_of_transfusers_largest_layers_is_small() {

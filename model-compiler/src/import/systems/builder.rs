@@ -118,19 +118,3 @@ impl<'a> Builder<'a> {
         }
     }
 }
-
-/// A square window with equal padding on all sides.
-pub(super) fn square(kernel: u8, stride: u8, padding: u8) -> Window {
-    Window {
-        kernel_h: kernel,
-        kernel_w: kernel,
-        stride_h: stride,
-        stride_w: stride,
-        pad_top: padding,
-        pad_bottom: padding,
-        pad_left: padding,
-        pad_right: padding,
-        dilation_h: 1,
-        dilation_w: 1,
-    }
-}

@@ -1,10 +1,11 @@
 //! ResNet of basic blocks: stem, then four stages.
 
-use super::builder::{Builder, square};
+use super::builder::Builder;
 use super::detect::{common_length, indexed_count};
 use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::{Op, ValueId};
+use firmware::program::Window;
 
 /// Channels the LiDAR histogram has in the published networks: below and above the height threshold.
 const LIDAR_CHANNELS: usize = 2;
@@ -46,9 +47,9 @@ impl ResNet {
     pub(super) fn stem(&self, b: &mut Builder<'_>, input: ValueId, channels: usize) -> Result<ValueId> {
         let p = &self.prefix;
         let shape = [self.stem, channels, 7, 7];
-        let map = b.conv_bn(&format!("{p}.conv1"), &format!("{p}.bn1"), input, shape, square(7, 2, 3))?;
+        let map = b.conv_bn(&format!("{p}.conv1"), &format!("{p}.bn1"), input, shape, Window::square(7, 2, 3))?;
         let map = b.push(format!("{p}.relu"), Op::Relu, &[map])?;
-        b.push(format!("{p}.maxpool"), Op::MaxPool(square(3, 2, 1)), &[map])
+        b.push(format!("{p}.maxpool"), Op::MaxPool(Window::square(3, 2, 1)), &[map])
     }
 
     /// The blocks of stage 1..=4; all but the first stage halve the resolution.
@@ -65,14 +66,14 @@ impl ResNet {
         let channels = usize::from(b.graph.value(input).shape.channels);
         let name = |leaf: &str| format!("{module}.{leaf}");
         let shape = [width, channels, 3, 3];
-        let map = b.conv_bn(&name("conv1"), &name("bn1"), input, shape, square(3, stride, 1))?;
+        let map = b.conv_bn(&name("conv1"), &name("bn1"), input, shape, Window::square(3, stride, 1))?;
         let map = b.push(name("relu"), Op::Relu, &[map])?;
-        let map = b.conv_bn(&name("conv2"), &name("bn2"), map, [width, width, 3, 3], square(3, 1, 1))?;
+        let map = b.conv_bn(&name("conv2"), &name("bn2"), map, [width, width, 3, 3], Window::square(3, 1, 1))?;
         let skip = if stride == 1 && channels == width {
             input
         } else {
             let shape = [width, channels, 1, 1];
-            b.conv_bn(&name("downsample.0"), &name("downsample.1"), input, shape, square(1, stride, 0))?
+            b.conv_bn(&name("downsample.0"), &name("downsample.1"), input, shape, Window::square(1, stride, 0))?
         };
         let sum = b.push(name("add"), Op::Add { relu: false }, &[map, skip])?;
         b.push(module, Op::Relu, &[sum])
