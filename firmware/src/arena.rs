@@ -1,4 +1,4 @@
-//! The arena: operands of a step as disjoint slices of one buffer, without `unsafe`.
+//! The arena: operands of a step as disjoint slices of one buffer, by checked means only.
 //!
 //! A step writes its output and its scratch and reads up to three tensors. The slices come from one
 //! `get_disjoint_mut`, so the borrow checker's rule holds at run time whatever the image says: where two of them

@@ -253,7 +253,7 @@ impl<'a, K: Kernels> Engine<'a, K> {
     }
 
     /// The arena, for tests of the memory plan (poison in dead bytes must not change any output). Whatever is written
-    /// here can make results wrong, never unsafe.
+    /// here can make results wrong, nothing worse.
     pub fn arena_mut(&mut self) -> &mut [u8] {
         self.arena
     }
