@@ -1,9 +1,9 @@
 //! The f32 reference meets what the original networks gave: waypoints and the means of inner features, at full size,
 //! for the graph as imported and as optimized.
 
+use host_sim::statistics::ErrorSums;
 use model_compiler::import::{ImportOptions, System, import};
 use model_compiler::ir::{Graph, InputKind, ValueId};
-use model_compiler::metrics::max_abs_error;
 use model_compiler::{passes, reference};
 use std::collections::BTreeMap;
 use tests::golden::{self, Expected, Frame};
@@ -72,7 +72,9 @@ fn check(what: &str, graph: &Graph, frames: &[Frame], expected: &Expected) {
         .unwrap_or_else(|e| panic!("{what}: {e}"));
         assert_eq!(seen, expected.taps.len(), "{what}: every tap is computed");
         let waypoints = expected.waypoints[i].as_flattened();
-        let error = max_abs_error(waypoints, &outputs[0]) as f32;
+        let mut errors = ErrorSums::default();
+        errors.add(waypoints, &outputs[0]);
+        let error = errors.largest_error() as f32;
         worst_waypoint = worst_waypoint.max(error);
         if !within(error, WAYPOINT_TOLERANCE) {
             misses.push(format!("frame {i}: waypoints {:?}, expected {waypoints:?}", outputs[0]));

@@ -250,7 +250,7 @@ pub trait Kernels {
     /// The kernels that this backend can read.
     const KERNELS: &'static [KernelId];
 
-    /// Convolution. `scratch`: [`plan::conv2d_scratch_bytes`], 16-byte aligned.
+    /// Convolution. `scratch`: [`plan::conv2d_scratch_bytes`]. All scratch is aligned to 4 bytes.
     fn conv2d(&self, args: &Conv2dArgs<'_>, input: &[i8], output: CodesMut<'_>, scratch: &mut [u8]) {
         portable::conv2d::conv2d(args, input, output, scratch);
     }

@@ -3,6 +3,8 @@
 //! The f64 model stands for the engine, since their bytes are equal; nothing has to be compiled.
 
 use crate::files::FrameSource;
+use crate::statistics::{ErrorSums, Spread};
+use crate::trace::input_codes;
 use indicatif::ProgressBar;
 use model_compiler::calibrate::{Statistics, calibrate};
 use model_compiler::error::{Error, ErrorCode, Result};
@@ -12,7 +14,7 @@ use model_compiler::integer_reference;
 use model_compiler::ir::{Graph, Op};
 use model_compiler::passes::PassOptions;
 use model_compiler::pipeline;
-use model_compiler::qmodel::QModel;
+use model_compiler::qmodel::{QModel, QTensor};
 use model_compiler::quantize::{QuantizeOptions, RangeRule, SkipStages, quantize};
 use model_compiler::reference;
 use serde::Serialize;
@@ -153,80 +155,46 @@ impl<'a> Bench<'a> {
     /// The quantizer refuses the choices.
     pub fn measure(&self, options: &QuantizeOptions, mut progress: impl FnMut(usize)) -> Result<Fidelity> {
         let model = quantize(&self.graph, &self.calibration, &self.statistics, options)?;
-        let mut sums = Sums::default();
+        let mut vectors = ErrorSums::default();
+        let mut distances = Vec::new();
         for (index, (frame, expected)) in self.evaluation.iter().zip(&self.expected).enumerate() {
             let [vector, waypoints] = self.integers(&model, frame)?;
-            sums.add_vector(&expected[0], &vector);
-            sums.add_waypoints(&expected[1], &waypoints);
+            vectors.add(&expected[0], &vector);
+            distances.resize(waypoints.len() / 2, Spread::default());
+            let pairs = expected[1].chunks_exact(2).zip(waypoints.chunks_exact(2));
+            for ((e, f), distance) in pairs.zip(&mut distances) {
+                distance.add(1e3 * f64::from(e[0] - f[0]).hypot(f64::from(e[1] - f[1])));
+            }
             progress(index + 1);
         }
-        Ok(sums.finish())
+        Ok(Fidelity {
+            vector_sqnr_db: vectors.sqnr_db(),
+            mean_mm: distances.iter().map(Spread::mean).collect(),
+            worst_mm: distances.iter().map(Spread::max).collect(),
+        })
     }
 
-    fn integers(&self, model: &QModel, frame: &Frame) -> Result<[Vec<f64>; 2]> {
+    fn integers(&self, model: &QModel, frame: &Frame) -> Result<[Vec<f32>; 2]> {
         let vector = vector_name(&self.graph)?;
-        let inputs = encode(model, frame)?;
+        let inputs = input_codes(model, frame)?;
         let mut seen = Vec::new();
         let outputs = integer_reference::run(model, &inputs, |_, step, codes| {
             let tensor = model.tensor(step.op.output());
             if tensor.value == vector {
-                seen = codes.iter().map(|c| (c - f64::from(tensor.zero_point)) * tensor.scale).collect();
+                seen = real(tensor, codes);
             }
         })?;
-        let scale = model.tensor(model.outputs[0].tensor).scale;
-        Ok([seen, outputs[0].iter().map(|c| c * scale).collect()])
+        Ok([seen, real(model.tensor(model.outputs[0].tensor), &outputs[0])])
     }
 }
 
-/// Input codes of a frame, by the f64 model's own rules.
-///
-/// # Errors
-/// The frame lacks an input of the model.
-pub fn encode(model: &QModel, frame: &Frame) -> Result<Vec<Vec<f64>>> {
-    let kinds = model.inputs.iter().filter_map(|port| port.kind);
-    kinds
-        .map(|kind| {
-            let raw: Vec<f64> = frame.raw(kind)?.into_iter().map(f64::from).collect();
-            Ok(integer_reference::encode_input(kind, &raw))
-        })
-        .collect()
+/// What codes of the f64 model stand for.
+fn real(tensor: &QTensor, codes: &[f64]) -> Vec<f32> {
+    codes.iter().map(|c| ((c - f64::from(tensor.zero_point)) * tensor.scale) as f32).collect()
 }
 
 fn vector_name(graph: &Graph) -> Result<&str> {
     let pool = graph.nodes.iter().rfind(|node| matches!(node.op, Op::GlobalPool));
     pool.map(|node| node.name.as_str())
         .ok_or_else(|| Error::new(ErrorCode::Unsupported, &graph.name, "found no global pool to measure at"))
-}
-
-#[derive(Default)]
-struct Sums {
-    signal: f64,
-    noise: f64,
-    distances: Vec<Vec<f64>>,
-}
-
-impl Sums {
-    fn add_vector(&mut self, expected: &[f32], found: &[f64]) {
-        for (&e, f) in expected.iter().zip(found) {
-            self.signal += f64::from(e).powi(2);
-            self.noise += (f64::from(e) - f).powi(2);
-        }
-    }
-
-    fn add_waypoints(&mut self, expected: &[f32], found: &[f64]) {
-        let pairs = expected.chunks_exact(2).zip(found.chunks_exact(2));
-        self.distances.resize(expected.len() / 2, Vec::new());
-        for ((e, f), distances) in pairs.zip(&mut self.distances) {
-            distances.push(1e3 * (f64::from(e[0]) - f[0]).hypot(f64::from(e[1]) - f[1]));
-        }
-    }
-
-    fn finish(self) -> Fidelity {
-        let mean = |d: &Vec<f64>| d.iter().sum::<f64>() / d.len() as f64;
-        Fidelity {
-            vector_sqnr_db: 10.0 * (self.signal / self.noise).log10(),
-            mean_mm: self.distances.iter().map(mean).collect(),
-            worst_mm: self.distances.iter().map(|d| d.iter().copied().fold(0.0, f64::max)).collect(),
-        }
-    }
 }

@@ -296,7 +296,7 @@ fn check_record(image: &Image<'_>, record: &Record) -> Result<()> {
 }
 
 /// Codes of the network's inputs, in the record's order.
-fn input_codes(model: &QModel, frame: &Frame) -> Result<Vec<Vec<f64>>> {
+pub(crate) fn input_codes(model: &QModel, frame: &Frame) -> Result<Vec<Vec<f64>>> {
     let codes = |port: &model_compiler::qmodel::Port| {
         let kind = port.kind.ok_or_else(|| {
             Error::new(ErrorCode::Malformed, "record", format!("input {} does not say what it holds", port.name))

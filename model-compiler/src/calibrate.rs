@@ -18,11 +18,9 @@ pub struct ValueStatistics {
     pub max: f64,
     /// Elements seen.
     pub count: u64,
-    /// Elements that are exactly zero (they quantize without error, whatever the scale).
-    pub zeros: u64,
     /// Mean per channel.
     pub channel_mean: Vec<f64>,
-    /// Equal bins over `[min, max]`, exact zeros left out.
+    /// Equal bins over `[min, max]`; exact zeros are left out, since they quantize without error at any scale.
     pub histogram: Vec<u64>,
 }
 
@@ -70,13 +68,9 @@ impl ValueStatistics {
     }
 
     fn see_distribution(&mut self, data: &[f32]) {
-        for &x in data {
-            if x == 0.0 {
-                self.zeros += 1;
-            } else {
-                let bin = self.bin_of(f64::from(x));
-                self.histogram[bin] += 1;
-            }
+        for &x in data.iter().filter(|x| **x != 0.0) {
+            let bin = self.bin_of(f64::from(x));
+            self.histogram[bin] += 1;
         }
     }
 }

@@ -12,7 +12,6 @@ pub mod integer_reference;
 pub mod ir;
 pub mod known_answer;
 pub mod memory_plan;
-pub mod metrics;
 pub mod pack;
 pub mod passes;
 pub mod pipeline;

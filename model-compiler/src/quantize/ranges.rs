@@ -144,13 +144,9 @@ mod tests {
         let max = data.iter().copied().fold(f64::NEG_INFINITY, f64::max);
         let mut s =
             ValueStatistics { min, max, count: data.len() as u64, histogram: vec![0; 4096], ..Default::default() };
-        for &x in data {
-            if x == 0.0 {
-                s.zeros += 1;
-            } else {
-                let bin = ((x - min) / (max - min) * 4096.0) as usize;
-                s.histogram[bin.min(4095)] += 1;
-            }
+        for &x in data.iter().filter(|x| **x != 0.0) {
+            let bin = ((x - min) / (max - min) * 4096.0) as usize;
+            s.histogram[bin.min(4095)] += 1;
         }
         s
     }
