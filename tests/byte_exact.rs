@@ -3,6 +3,7 @@
 use firmware::engine::Engine;
 use firmware::image::Image;
 use firmware::kernels::Portable;
+use host_sim::backends::Backend;
 use host_sim::run::ModelInfo;
 use host_sim::verify::{Sources, compare};
 use indicatif::ProgressBar;
@@ -17,10 +18,10 @@ use tests::golden::{self, Network};
 
 const SYSTEMS: [System; 3] = [System::Aim, System::LateFusion, System::TransFuser];
 
-fn assert_byte_exact(compiled: &Compiled, frames: &[Frame]) {
+fn assert_byte_exact(compiled: &Compiled, frames: &[Frame], backend: Backend) {
     let bytes = AlignedBytes::from(compiled.image.as_slice());
     let image = Image::parse(&bytes).unwrap_or_else(|e| panic!("{e}"));
-    let sources = Sources { image, record: &compiled.record, graph: None };
+    let sources = Sources { image, record: &compiled.record, graph: None, backend };
     let info = ModelInfo { name: compiled.record.model.name.clone(), sha256: String::new() };
     let report = compare(&sources, frames, info, &ProgressBar::hidden()).unwrap_or_else(|e| panic!("{e}"));
     assert!(report.bytes_equal, "{:?}", report.first_difference);
@@ -48,7 +49,9 @@ fn small_networks_are_byte_exact() {
         let graph = build::small(&network);
         for skip in [SkipStages::narrow(), SkipStages::wide()] {
             let compiled = compile(&graph, skip);
-            assert_byte_exact(&compiled, &build::frames_of(&graph));
+            for backend in Backend::all() {
+                assert_byte_exact(&compiled, &build::frames_of(&graph), backend);
+            }
             assert_self_test_passes(&compiled);
         }
     }
@@ -59,7 +62,8 @@ fn full_size_networks_are_byte_exact() {
     for system in SYSTEMS {
         let graph = build::graph(golden::checkpoint(system));
         let compiled = compile(&graph, SkipStages::narrow());
-        assert_byte_exact(&compiled, &build::frames_of(&graph));
+        let fastest = Backend::choose(None).unwrap_or_else(|e| panic!("{e}"));
+        assert_byte_exact(&compiled, &build::frames_of(&graph), fastest);
         assert_self_test_passes(&compiled);
     }
 }

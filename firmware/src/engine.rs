@@ -140,7 +140,7 @@ impl<'a, K: Kernels> Engine<'a, K> {
     /// Takes the first bytes of `arena`; whatever they hold is overwritten before it is read.
     ///
     /// # Errors
-    /// The arena is too small or misaligned, or the image uses a kernel outside `K::KERNELS`.
+    /// The arena is too small or misaligned, or the image uses a kernel that the backend does not support.
     pub fn new(image: Image<'a>, kernels: K, arena: &'a mut [u8]) -> Result<Self, EngineError> {
         let needed = image.arena_bytes();
         let found = u32::try_from(arena.len()).unwrap_or(u32::MAX);
@@ -152,7 +152,7 @@ impl<'a, K: Kernels> Engine<'a, K> {
         }
         let arena = arena.get_mut(..index(needed)).ok_or(EngineError::ArenaTooSmall { found, needed })?;
         for kernel in KernelId::ALL {
-            if image.features() & kernel.feature() != 0 && !K::KERNELS.contains(kernel) {
+            if image.features() & kernel.feature() != 0 && !kernels.supported().contains(kernel) {
                 return Err(EngineError::KernelMissing(*kernel));
             }
         }

@@ -2,14 +2,17 @@
 //! scratch. Every default is [`portable`], the norm that any other backend must equal byte for byte.
 //!
 //! A backend is a zero-sized token, proof that its instructions exist. It lists the [`KernelId`]s that it can read and
-//! overrides the methods that it accelerates. Methods are infallible: `Image::parse` has proved shapes, lengths and
-//! alignment, and all arithmetic is total (hostile constants give wrong numbers, never a panic).
+//! overrides the methods that it accelerates; the choice between several at run time is a `&dyn Kernels`. Methods are
+//! infallible: `Image::parse` has proved shapes, lengths and alignment, and all arithmetic is total (hostile constants
+//! give wrong numbers, never a panic).
 
 use crate::program::{Clamp, KernelId, Requant, Window};
 use crate::tensor::{Codes, CodesMut, Shape};
 
 pub mod plan;
 pub mod portable;
+#[cfg(target_arch = "x86_64")]
+pub mod x86_64;
 
 /// Arrays per output channel of a [`crate::program::Rescale`]; all of the output channel count.
 #[derive(Clone, Copy, Debug)]
@@ -248,7 +251,7 @@ pub struct WaypointDecoderArgs<'a> {
 /// One method per operator; see the module page. Operand layouts are those of [`crate::tensor`].
 pub trait Kernels {
     /// The kernels that this backend can read.
-    const KERNELS: &'static [KernelId];
+    fn supported(&self) -> &'static [KernelId];
 
     /// Convolution. `scratch`: [`plan::conv2d_scratch_bytes`]. All scratch is aligned to 4 bytes.
     fn conv2d(&self, args: &Conv2dArgs<'_>, input: &[i8], output: CodesMut<'_>, scratch: &mut [u8]) {
@@ -328,10 +331,82 @@ pub trait Kernels {
     }
 }
 
+/// A borrowed backend is one: every method goes to the backend behind the reference.
+impl<K: Kernels + ?Sized> Kernels for &K {
+    fn supported(&self) -> &'static [KernelId] {
+        (**self).supported()
+    }
+
+    fn conv2d(&self, args: &Conv2dArgs<'_>, input: &[i8], output: CodesMut<'_>, scratch: &mut [u8]) {
+        (**self).conv2d(args, input, output, scratch);
+    }
+
+    fn linear(&self, args: &LinearArgs<'_>, input: Codes<'_>, output: CodesMut<'_>, scratch: &mut [u8]) {
+        (**self).linear(args, input, output, scratch);
+    }
+
+    fn max_pool(&self, args: &PoolArgs, input: Option<Codes<'_>>, output: CodesMut<'_>) {
+        (**self).max_pool(args, input, output);
+    }
+
+    fn average_pool(&self, args: &PoolArgs, requant: &RequantArgs, input: Codes<'_>, output: CodesMut<'_>) {
+        (**self).average_pool(args, requant, input, output);
+    }
+
+    fn global_pool(&self, channels: u16, sum: &SumArgs, terms: &[TermArgs<'_>], output: CodesMut<'_>) {
+        (**self).global_pool(channels, sum, terms, output);
+    }
+
+    fn add(&self, sum: &SumArgs, terms: &[TermArgs<'_>; 2], output: CodesMut<'_>) {
+        (**self).add(sum, terms, output);
+    }
+
+    fn requantize(&self, args: &RequantArgs, input: Codes<'_>, output: CodesMut<'_>) {
+        (**self).requantize(args, input, output);
+    }
+
+    fn resize_bilinear(&self, args: &ResizeArgs<'_>, output: CodesMut<'_>) {
+        (**self).resize_bilinear(args, output);
+    }
+
+    fn tokens(&self, args: &TokensArgs<'_>, output: CodesMut<'_>) {
+        (**self).tokens(args, output);
+    }
+
+    fn layer_norm(&self, args: &LayerNormArgs<'_>, input: Codes<'_>, output: CodesMut<'_>) {
+        (**self).layer_norm(args, input, output);
+    }
+
+    fn attention(
+        &self,
+        args: &AttentionArgs<'_>,
+        query: Option<&[i8]>,
+        key: &[i8],
+        value: &[i8],
+        output: CodesMut<'_>,
+        scratch: &mut [u8],
+    ) {
+        (**self).attention(args, query, key, value, output, scratch);
+    }
+
+    fn waypoint_decoder(
+        &self,
+        args: &WaypointDecoderArgs<'_>,
+        hidden: &[i16],
+        goal: &[i32],
+        waypoints: &mut [i32],
+        scratch: &mut [u8],
+    ) {
+        (**self).waypoint_decoder(args, hidden, goal, waypoints, scratch);
+    }
+}
+
 /// The norm: plain Rust, any target.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Portable;
 
 impl Kernels for Portable {
-    const KERNELS: &'static [KernelId] = &[KernelId::Direct];
+    fn supported(&self) -> &'static [KernelId] {
+        KernelId::ALL
+    }
 }

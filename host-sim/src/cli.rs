@@ -3,6 +3,7 @@
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
 use crate::ablation;
+use crate::backends::{Backend, BackendKind};
 use crate::files::FrameSource;
 use crate::report::{VerifyReport, json, terminal};
 use crate::{demo, run, verify};
@@ -53,6 +54,8 @@ enum Command {
         #[command(flatten)]
         frames: FrameSource,
         #[command(flatten)]
+        backend: BackendArgs,
+        #[command(flatten)]
         common: Common,
     },
     /// Compares every byte of every step with an f64 model, and every value with the f32 network.
@@ -68,6 +71,8 @@ enum Command {
         import: ImportArgs,
         #[command(flatten)]
         frames: FrameSource,
+        #[command(flatten)]
+        backend: BackendArgs,
         /// Build record of the image [default: OUT.record beside OUT.img].
         #[arg(long, value_name = "FILE")]
         record: Option<PathBuf>,
@@ -98,6 +103,19 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
+}
+
+#[derive(Debug, Args)]
+struct BackendArgs {
+    /// Kernels: portable, avx2 or avx512-vnni; all give the same bytes [default: the fastest of this machine].
+    #[arg(long, value_name = "NAME")]
+    backend: Option<BackendKind>,
+}
+
+impl BackendArgs {
+    fn choose(&self) -> Result<Backend> {
+        Backend::choose(self.backend)
+    }
 }
 
 #[derive(Debug, Args)]
@@ -165,15 +183,17 @@ impl Command {
 
     fn execute(self, console: &mut Console<'_>, progress: &ProgressBar) -> Result<u8> {
         match self {
-            Self::Run { model, import, frames, common } => {
-                let report = run::run(&model, &import.options()?, &frames, progress)?;
+            Self::Run { model, import, frames, backend, common } => {
+                let report = run::run(&model, &import.options()?, &frames, backend.choose()?, progress)?;
                 progress.finish_and_clear();
                 console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(0)
             }
-            Self::Verify { image, model, import, frames, record, mirror, min_sqnr, common } => {
+            Self::Verify { image, model, import, frames, backend, record, mirror, min_sqnr, common } => {
                 let import = import.options()?;
-                let options = verify::Options { image, record, model, import, frames, mirror, min_sqnr_db: min_sqnr };
+                let backend = backend.choose()?;
+                let options =
+                    verify::Options { image, record, model, import, frames, backend, mirror, min_sqnr_db: min_sqnr };
                 let report = verify::verify(&options, progress)?;
                 warn(&report, console);
                 console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });

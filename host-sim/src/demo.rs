@@ -10,6 +10,7 @@
 //! The bundled network is small and untrained. What the demo shows is that the engine computes what the arithmetic's
 //! definition says, to the last byte, and how near that is to f32; never how to drive.
 
+use crate::backends::Backend;
 use crate::files::{self, FrameSource};
 use crate::report::{VerifyReport, json, terminal};
 use crate::verify;
@@ -148,6 +149,7 @@ fn verified(bundle: &Bundle, image: PathBuf, progress: &ProgressBar) -> Result<V
         model: Some(bundle.checkpoint()),
         import: ImportOptions::default(),
         frames: FrameSource { frames: Some(bundle.frames("evaluation")), inputs: None },
+        backend: Backend::choose(None)?,
         mirror: true,
         min_sqnr_db: None,
     };

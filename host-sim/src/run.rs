@@ -1,11 +1,11 @@
 //! Waypoints of frames: int8 from an image, f32 from a checkpoint.
 
+use crate::backends::Backend;
 use crate::buffers::GuardedArena;
 use crate::codes::decode;
 use crate::files::{self, FrameSource, ImageFile};
 use firmware::engine::{Engine, EngineError};
 use firmware::image::{Image, Port, TensorRecord};
-use firmware::kernels::Portable;
 use firmware::tensor::ElementType;
 use indicatif::ProgressBar;
 use model_compiler::artifact;
@@ -54,9 +54,15 @@ pub struct RunReport {
 ///
 /// # Errors
 /// The model or a frame cannot be read, or the network does not give waypoints.
-pub fn run(model: &Path, import: &ImportOptions, source: &FrameSource, progress: &ProgressBar) -> Result<RunReport> {
+pub fn run(
+    model: &Path,
+    import: &ImportOptions,
+    source: &FrameSource,
+    backend: Backend,
+    progress: &ProgressBar,
+) -> Result<RunReport> {
     if files::is_image_file(model)? {
-        run_image(&ImageFile::read(model)?, source, progress)
+        run_image(&ImageFile::read(model)?, source, backend, progress)
     } else {
         let graph = files::load_graph(model, import)?;
         let info = ModelInfo { name: graph.name.clone(), sha256: files::file_sha256(model)? };
@@ -64,9 +70,9 @@ pub fn run(model: &Path, import: &ImportOptions, source: &FrameSource, progress:
     }
 }
 
-fn run_image(file: &ImageFile, source: &FrameSource, progress: &ProgressBar) -> Result<RunReport> {
+fn run_image(file: &ImageFile, source: &FrameSource, backend: Backend, progress: &ProgressBar) -> Result<RunReport> {
     let image = file.parse()?;
-    let mut device = Device::new(image)?;
+    let mut device = Device::new(image, backend)?;
     let frames = source.load(&files::frame_format(&image)?)?;
     let waypoints = each_frame(&frames, progress, |frame| device.waypoints(frame))?;
     let model = ModelInfo { name: image.name().to_owned(), sha256: artifact::hex(&file.sha256()) };
@@ -108,26 +114,27 @@ pub fn waypoints(values: &[f32]) -> Waypoints {
 /// An image with its working memory and the output that holds the waypoints.
 struct Device<'a> {
     image: Image<'a>,
+    backend: Backend,
     arena: GuardedArena,
     port: Port<'a>,
     record: TensorRecord,
 }
 
 impl<'a> Device<'a> {
-    fn new(image: Image<'a>) -> Result<Self> {
+    fn new(image: Image<'a>, backend: Backend) -> Result<Self> {
         let port = image.output(0).and_then(|port| Some((port, image.tensor(port.tensor)?)));
         let is_waypoints = |record: &TensorRecord| record.element == ElementType::I32 && record.shape.channels == 2;
         let (port, record) =
             port.filter(|(_, record)| is_waypoints(record)).ok_or_else(|| no_waypoints(image.name()))?;
         let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
-        Ok(Self { image, arena, port, record })
+        Ok(Self { image, backend, arena, port, record })
     }
 
     fn waypoints(&mut self, frame: &Frame) -> Result<Waypoints> {
         let inputs = self.input_bytes(frame)?;
         let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
         let refuse = |e: EngineError| Error::new(ErrorCode::Malformed, "engine", e.to_string());
-        let mut engine = Engine::new(self.image, Portable, self.arena.poisoned(0)).map_err(refuse)?;
+        let mut engine = Engine::new(self.image, self.backend.kernels(), self.arena.poisoned(0)).map_err(refuse)?;
         engine.infer(&inputs).map_err(refuse)?;
         let codes = decode(engine.output(0).map_err(refuse)?, self.record.element);
         let real = |&code: &i32| (f64::from(code) - f64::from(self.port.zero_point)) * f64::from(self.port.scale);

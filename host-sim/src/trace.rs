@@ -1,12 +1,12 @@
 //! One frame through all three: the engine, the f64 model and, where a checkpoint is given, the f32 network.
 
+use crate::backends::Backend;
 use crate::buffers::GuardedArena;
 use crate::codes::{SaturationBounds, decode, dequantize};
 use crate::compare::{StepDifference, first_difference};
 use crate::statistics::ErrorSums;
 use firmware::engine::Engine;
 use firmware::image::Image;
-use firmware::kernels::Portable;
 use firmware::tensor::Shape;
 use indicatif::ProgressBar;
 use model_compiler::error::{Error, ErrorCode, Result};
@@ -50,6 +50,7 @@ pub struct Tracer<'a> {
     record: &'a Record,
     reference: Option<FloatNetwork<'a>>,
     arena: GuardedArena,
+    backend: Backend,
     frames: u32,
     /// By position in the program.
     figures: Vec<StepFigures>,
@@ -96,12 +97,12 @@ impl<'a> Tracer<'a> {
     ///
     /// # Errors
     /// Image and record, or record and graph, do not belong together.
-    pub fn new(image: Image<'a>, record: &'a Record, graph: Option<&'a Graph>) -> Result<Self> {
+    pub fn new(image: Image<'a>, record: &'a Record, graph: Option<&'a Graph>, backend: Backend) -> Result<Self> {
         check_record(&image, record)?;
         let reference = graph.map(|graph| FloatNetwork::new(graph, &record.model)).transpose()?;
         let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
         let figures = vec![StepFigures { equal: true, ..StepFigures::default() }; record.plan.order.len()];
-        Ok(Self { image, record, reference, arena, frames: 0, figures })
+        Ok(Self { image, record, reference, arena, backend, frames: 0, figures })
     }
 
     /// Figures by position in the program.
@@ -152,7 +153,7 @@ impl<'a> Tracer<'a> {
         // Two patterns in turn, so that a byte that is read before it was written cannot go unnoticed.
         let arena = self.arena.poisoned(if self.frames.is_multiple_of(2) { 0x5A } else { 0xA5 });
         let refuse = |e: firmware::engine::EngineError| Error::new(ErrorCode::Check, "engine", e.to_string());
-        let mut engine = Engine::new(self.image, Portable, arena).map_err(refuse)?;
+        let mut engine = Engine::new(self.image, self.backend.kernels(), arena).map_err(refuse)?;
         let observe = |position: usize, _: &firmware::program::Step, bytes: &[u8]| {
             tensors[written[position]] = bytes.to_vec();
             progress.inc(1);

@@ -1,5 +1,6 @@
 //! Proof and measure of an image: its bytes against the f64 model, its numbers against the f32 network.
 
+use crate::backends::Backend;
 use crate::codes;
 use crate::files::{self, FrameSource, ImageFile};
 use crate::report::{FrameReport, StepReport, Summary, VerifyReport, WaypointError, worst};
@@ -31,6 +32,8 @@ pub struct Options {
     pub import: ImportOptions,
     /// Frames to run.
     pub frames: FrameSource,
+    /// Kernels of the engine.
+    pub backend: Backend,
     /// Also run the mirror image of every frame.
     pub mirror: bool,
     /// Fail where a step's accumulated SQNR is below this, dB.
@@ -54,7 +57,7 @@ pub fn verify(options: &Options, progress: &ProgressBar) -> Result<VerifyReport>
         let error = Error::new(ErrorCode::Usage, "--min-sqnr", "needs the f32 network to compare with");
         return Err(error.with_help("add --model MODEL"));
     }
-    let sources = Sources { image, record: &record, graph: graph.as_ref() };
+    let sources = Sources { image, record: &record, graph: graph.as_ref(), backend: options.backend };
     let model = ModelInfo { name: record.model.name.clone(), sha256: artifact::hex(&file.sha256()) };
     let mut report = compare(&sources, &frames, model, progress)?;
     report.summary.flash_bytes = file.flash_bytes();
@@ -71,6 +74,8 @@ pub struct Sources<'a> {
     pub record: &'a Record,
     /// The f32 network.
     pub graph: Option<&'a Graph>,
+    /// Kernels of the engine.
+    pub backend: Backend,
 }
 
 /// Traces frames up to the first with unequal bytes and sums up.
@@ -84,7 +89,7 @@ pub fn compare(
     progress: &ProgressBar,
 ) -> Result<VerifyReport> {
     let record = sources.record;
-    let mut tracer = Tracer::new(sources.image, record, sources.graph)?;
+    let mut tracer = Tracer::new(sources.image, record, sources.graph, sources.backend)?;
     progress.set_length(tracer.units_per_frame() * frames.len() as u64);
     let known = calibration_digests(&record.model);
     let overlap = frames::overlap(&known, frames);
@@ -207,7 +212,8 @@ mod tests {
 
     fn compare_sample(sample: &Sample, graph: Option<&Graph>, frames: &[Frame]) -> Result<VerifyReport> {
         let image = Image::parse(&sample.image).expect("the sample is a valid image");
-        compare(&Sources { image, record: &sample.record, graph }, frames, info(), &ProgressBar::hidden())
+        let sources = Sources { image, record: &sample.record, graph, backend: Backend::choose(None)? };
+        compare(&sources, frames, info(), &ProgressBar::hidden())
     }
 
     #[test]
@@ -283,6 +289,7 @@ mod tests {
             model: None,
             import: ImportOptions::default(),
             frames: FrameSource { frames: None, inputs: Some(path("inputs.safetensors")) },
+            backend: Backend::choose(None).unwrap(),
             mirror: false,
             min_sqnr_db: None,
         };
