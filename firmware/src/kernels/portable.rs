@@ -17,5 +17,7 @@ mod product;
 pub mod resize_bilinear;
 pub mod tokens;
 pub mod waypoint_decoder;
+mod windows;
 
 pub(crate) use axis::Axis;
+pub(crate) use windows::Windows;
