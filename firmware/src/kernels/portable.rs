@@ -20,4 +20,7 @@ pub mod waypoint_decoder;
 mod windows;
 
 pub(crate) use axis::Axis;
+#[cfg(target_arch = "x86_64")]
+pub(crate) use codes::{Code, operand_len, take};
+#[cfg(target_arch = "x86_64")]
 pub(crate) use windows::Windows;
