@@ -1,7 +1,5 @@
 //! Backends for x86-64. A token exists only where the processor and the operating system have its instructions.
 
-#![allow(unsafe_code, reason = "instructions beyond the target's own; every block says why it is sound")]
-
 use super::{Conv2dArgs, Kernels, LinearArgs, portable};
 use crate::program::KernelId;
 use crate::tensor::{Codes, CodesMut};
@@ -41,10 +39,8 @@ impl Avx512Vnni {
         let vnni = || core::arch::x86_64::__cpuid_count(7, 0).ecx >> VNNI_BIT & 1 == 1;
         (avx512::get() && vnni()).then_some(Self { _proof: () })
     }
-}
 
-impl Avx512Vnni {
-    /// AVX-512 includes AVX2.
+    /// [`Self::detect`] asks for AVX2 too.
     fn avx2(self) -> Avx2 {
         Avx2 { _proof: () }
     }

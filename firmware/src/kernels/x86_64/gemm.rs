@@ -2,8 +2,8 @@
 //! product, the same for every instruction set.
 //!
 //! Scratch takes the windows of as many output positions as fit, one row each, copied once for all output channels. Then
-//! 64 output channels at a time meet all these rows, a tile of 6 rows after the other, so that their weights are read
-//! from memory once and from the second-level cache after that.
+//! 64 output channels at a time meet all these rows, a tile of 6 rows after the other, so that their weights come from
+//! memory once and from the second-level cache after that.
 
 use super::super::k4n16::{OUTPUTS, Packed, QUAD, block_bytes};
 use super::super::plan::{PACKED_TILE_ROWS, row_stride_bytes};
@@ -157,7 +157,7 @@ struct Product<'a> {
 }
 
 impl Product<'_> {
-    /// `fill` copies the codes of a position to a row of `depth` codes. `None`, with the output as it was, where operands
+    /// `fill` copies the codes of a position to a row of `depth` codes. `None` where operands
     /// do not have the lengths that the arguments say.
     fn run<T: Tile>(
         &self,

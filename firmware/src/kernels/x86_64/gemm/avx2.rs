@@ -3,6 +3,8 @@
 //!
 //! `vpmaddubsw` on codes + 128 would take half the instructions, but saturates: 2·255·127 > 2^15.
 
+#![allow(unsafe_code, reason = "instructions beyond the target's own, and their loads and stores")]
+
 use super::epilogue::Epilogue;
 use super::{BLOCKS, CHANNELS, Operands, ROWS, Sums, Tile};
 use crate::kernels::k4n16::{COMPENSATION_BYTES, QUAD, QUAD_BYTES};

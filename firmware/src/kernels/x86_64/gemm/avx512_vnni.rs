@@ -1,6 +1,8 @@
 //! The tile for AVX-512 VNNI: `vpdpbusd` multiplies unsigned codes (raised by 128) with signed weights, four depth
 //! elements of 16 output channels at once, and adds exactly; the packed compensation takes the 128 out again.
 
+#![allow(unsafe_code, reason = "instructions beyond the target's own, and their loads and stores")]
+
 use super::epilogue::Epilogue;
 use super::{BLOCKS, CHANNELS, Operands, ROWS, Sums, Tile};
 use crate::kernels::k4n16::{COMPENSATION_BYTES, OUTPUTS, QUAD, QUAD_BYTES};
