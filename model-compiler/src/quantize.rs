@@ -6,7 +6,7 @@
 
 use crate::calibrate::{self, Statistics};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Graph, Node, Op, ValueId};
+use crate::ir::{Clip, Graph, Node, Op, ValueId};
 use crate::qmodel::{Bounds, Port, QModel, QOp, QStep, QTensor, QTensorId};
 use firmware::program::Clamp;
 use firmware::tensor::ElementType;
@@ -193,13 +193,19 @@ impl Builder<'_> {
             }
             Op::AveragePool(window) => self.average_pool(node, window),
             Op::GlobalPool => self.global_pool(node),
-            Op::Add { relu } => self.add(node, *relu),
+            Op::Add { clip } => self.add(node, *clip),
             Op::ResizeBilinear { factor } => self.resize_bilinear(node, *factor),
             Op::Tokens(tokens) => self.tokens(node, tokens),
             Op::LayerNorm(norm) => self.layer_norm(node, norm),
             Op::Attention { heads } => self.attention(node, *heads),
             Op::WaypointDecoder(decoder) => self.waypoint_decoder(node, decoder),
-            Op::Normalize(_) | Op::BatchNorm(_) | Op::Relu => Err(Error::new(
+            Op::Normalize(_)
+            | Op::BatchNorm(_)
+            | Op::Clip(_)
+            | Op::Slice(_)
+            | Op::Pad(_)
+            | Op::Concat(_)
+            | Op::Softmax => Err(Error::new(
                 ErrorCode::Unsupported,
                 "",
                 format!("{} stands alone and has no integer form", node.op.name()),
@@ -273,10 +279,15 @@ impl Builder<'_> {
         self.model.tensor(id).zero_point as i16
     }
 
-    /// Bounds of an output code; ReLU raises the lower one to the zero point.
-    fn clamp(&self, id: QTensorId, relu: bool) -> Clamp {
-        let (min, max) = code_range(self.model.tensor(id).element);
-        Clamp { min: if relu { self.zero_point(id).max(min) } else { min }, max }
+    /// Bounds of an output code: those of its type, and the codes nearest to the clip (ReLU: the zero point).
+    fn clamp(&self, id: QTensorId, clip: Clip) -> Clamp {
+        let tensor = self.model.tensor(id);
+        let (min, max) = code_range(tensor.element);
+        let code = |bound: f32| {
+            let code = factors::round(f64::from(bound) / tensor.scale) + f64::from(tensor.zero_point);
+            code.clamp(f64::from(min), f64::from(max)) as i16
+        };
+        Clamp { min: code(clip.min), max: code(clip.max) }
     }
 
     /// Largest `|q − z|` of a tensor.

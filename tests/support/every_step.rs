@@ -9,7 +9,7 @@ use firmware::tensor::Shape;
 use model_compiler::emit::{AlignedBytes, ImageParts, KnownAnswer};
 use model_compiler::frames::{ByteMap, Frame};
 use model_compiler::ir::{
-    Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Tokens, ValueId, WaypointDecoder, Weights,
+    Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Tokens, ValueId, WaypointDecoder, Weights,
 };
 use model_compiler::pack::pack;
 use model_compiler::pipeline::{self, Compiled};
@@ -51,16 +51,16 @@ pub fn graph() -> Graph {
     let velocity = b.graph.push_input("velocity", InputKind::Velocity, Shape::vector(1));
     let goal = b.graph.push_input("goal", InputKind::Goal, Shape::vector(2));
     let image = b.image_branch(rgb);
-    let stem = b.conv("lidar.stem", &[bev], Window::square(3, 2, 1), 1, None, true);
+    let stem = b.conv("lidar.stem", &[bev], Window::square(3, 2, 1), 1, None, Clip::RELU);
     let lidar = b.push("lidar.pool", Op::AveragePool(Window::square(2, 2, 0)), &[stem]);
     let [image_tokens, lidar_tokens] = b.transformer(image, lidar, velocity);
     let enlarged = Op::ResizeBilinear { factor: (2, 2) };
     let image = b.push("image.fused", enlarged.clone(), &[image_tokens, image]);
     let lidar_tokens = b.push("lidar.enlarged", enlarged, &[lidar_tokens]);
-    let lidar = b.push("lidar.fused", Op::Add { relu: true }, &[lidar, lidar_tokens]);
+    let lidar = b.push("lidar.fused", Op::Add { clip: Clip::RELU }, &[lidar, lidar_tokens]);
     let features = b.push("features", Op::GlobalPool, &[image, lidar]);
-    let joined = b.linear("join.0", &[features], 6, true);
-    let hidden = b.linear("join.2", &[joined], CHANNELS, false);
+    let joined = b.linear("join.0", &[features], 6, Clip::RELU);
+    let hidden = b.linear("join.2", &[joined], CHANNELS, Clip::NONE);
     let decoder = b.decoder();
     let waypoints = b.push("waypoints", decoder, &[hidden, goal]);
     b.graph.outputs.push(waypoints);
@@ -151,7 +151,7 @@ impl Builder {
         window: Window,
         groups: u16,
         normalization: Option<Normalization>,
-        relu: bool,
+        clip: Clip,
     ) -> ValueId {
         let depth = self.channels(inputs[0]) / usize::from(groups);
         let conv = Conv2d {
@@ -160,14 +160,14 @@ impl Builder {
             window,
             groups,
             normalization: normalization.map(Arc::new),
-            relu,
+            clip,
         };
         self.push(name, Op::Conv2d(conv), inputs)
     }
 
-    fn linear(&mut self, name: &str, inputs: &[ValueId], outputs: usize, relu: bool) -> ValueId {
+    fn linear(&mut self, name: &str, inputs: &[ValueId], outputs: usize, clip: Clip) -> ValueId {
         let depth = self.channels(inputs[0]);
-        let linear = Linear { weights: self.weights(&[outputs, depth]), bias: Some(self.bias(outputs)), relu };
+        let linear = Linear { weights: self.weights(&[outputs, depth]), bias: Some(self.bias(outputs)), clip };
         self.push(name, Op::Linear(linear), inputs)
     }
 
@@ -180,10 +180,10 @@ impl Builder {
     /// Strided stem, padded max pool, a residual block with a grouped convolution.
     fn image_branch(&mut self, rgb: ValueId) -> ValueId {
         let normalization = Normalization { mean: vec![124.0, 116.0, 104.0], std: vec![58.0, 57.0, 57.5] };
-        let stem = self.conv("image.stem", &[rgb], Window::square(3, 2, 1), 1, Some(normalization), false);
+        let stem = self.conv("image.stem", &[rgb], Window::square(3, 2, 1), 1, Some(normalization), Clip::NONE);
         let pooled = self.push("image.pool", Op::MaxPool(Window::square(3, 2, 1)), &[stem]);
-        let grouped = self.conv("image.conv1", &[pooled], Window::square(3, 1, 1), 2, None, true);
-        self.conv("image.conv2", &[grouped, pooled], Window::square(3, 1, 1), 1, None, true)
+        let grouped = self.conv("image.conv1", &[pooled], Window::square(3, 1, 1), 2, None, Clip::RELU);
+        self.conv("image.conv2", &[grouped, pooled], Window::square(3, 1, 1), 1, None, Clip::RELU)
     }
 
     /// One layer over four tokens of each branch; returns the normalized maps of both.
@@ -196,12 +196,12 @@ impl Builder {
         };
         let x = self.push("tokens", Op::Tokens(tokens), &[image, lidar, velocity]);
         let normed = self.layer_norm("ln1", x, 0, (8, 1));
-        let heads = ["query", "key", "value"].map(|name| self.linear(name, &[normed], CHANNELS, false));
+        let heads = ["query", "key", "value"].map(|name| self.linear(name, &[normed], CHANNELS, Clip::NONE));
         let context = self.push("attention", Op::Attention { heads: 2 }, &heads);
-        let x = self.linear("proj", &[context, x], CHANNELS, false);
+        let x = self.linear("proj", &[context, x], CHANNELS, Clip::NONE);
         let normed = self.layer_norm("ln2", x, 0, (8, 1));
-        let mlp = self.linear("mlp.0", &[normed], 8, true);
-        let x = self.linear("mlp.2", &[mlp, x], CHANNELS, false);
+        let mlp = self.linear("mlp.0", &[normed], 8, Clip::RELU);
+        let x = self.linear("mlp.2", &[mlp, x], CHANNELS, Clip::NONE);
         [("ln_f.image", 0), ("ln_f.lidar", 4)].map(|(name, first_row)| self.layer_norm(name, x, first_row, (2, 2)))
     }
 

@@ -1,12 +1,12 @@
 //! Batch norm into the weights and bias of the convolution before it.
 
 use super::rewrite::merge_into_reader;
-use crate::ir::{BatchNorm, Conv2d, Graph, Op, Weights};
+use crate::ir::{BatchNorm, Clip, Conv2d, Graph, Op, Weights};
 use std::sync::Arc;
 
 pub(super) fn run(graph: &mut Graph) {
     merge_into_reader(graph, |producer, reader, _| match (&producer.op, &reader.op) {
-        (Op::Conv2d(conv), Op::BatchNorm(norm)) if !conv.relu && producer.inputs.len() == 1 => {
+        (Op::Conv2d(conv), Op::BatchNorm(norm)) if conv.clip == Clip::NONE && producer.inputs.len() == 1 => {
             Some((Op::Conv2d(fold(conv, norm)), producer.inputs.clone()))
         }
         _ => None,

@@ -3,7 +3,7 @@
 use super::factors::{self, Factor, bits, round};
 use super::{Builder, bounds_of, tables};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{LayerNorm, Node, Tokens};
+use crate::ir::{Clip, LayerNorm, Node, Tokens};
 use crate::qmodel::{QOp, QTensorId, QTokenSource};
 
 /// Largest row, head and channel counts for which the bounds of the numerics page hold.
@@ -73,7 +73,7 @@ impl Builder<'_> {
             position,
             shift: terms.shift,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         self.step(node, op, bounds_of(bits(accumulator), &[terms.bound], terms.rounding));
         Ok(())
@@ -113,7 +113,7 @@ impl Builder<'_> {
             offsets: offsets.iter().map(|b| round(b * offset_unit) as i64).collect(),
             shift: shift as u8,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         self.step(node, op, bounds_of(bits(c * self.code_magnitude(input)), &[product, variance_bound], 0.0));
         Ok(())
@@ -146,7 +146,7 @@ impl Builder<'_> {
             exp_table: tables::exp2_table(),
             requant,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         // |A·R_s| ≤ 127·2^(c+22), c ≤ 24: one bit below 2^53 for 512 keys.
         let normalized = 127.0 * f64::exp2(f64::from(bits(f64::from(shape.positions()) * 32767.0)) + 22.0);

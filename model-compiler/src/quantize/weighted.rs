@@ -3,7 +3,7 @@
 use super::factors::{self, Factor, bits, round};
 use super::{Builder, bounds_of};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Conv2d, Linear, Node, Normalization, ValueId};
+use crate::ir::{Clip, Conv2d, Linear, Node, Normalization, ValueId};
 use crate::qmodel::{Bounds, QOp, QRescale, QResidual, QTensorId};
 use firmware::tensor::ElementType;
 
@@ -19,7 +19,7 @@ struct Layer<'a> {
     inputs: usize,
     groups: usize,
     normalization: Option<&'a Normalization>,
-    relu: bool,
+    clip: Clip,
 }
 
 impl Layer<'_> {
@@ -55,7 +55,7 @@ impl Builder<'_> {
             inputs: conv.weights.shape[3],
             groups: usize::from(conv.groups),
             normalization: conv.normalization.as_deref(),
-            relu: conv.relu,
+            clip: conv.clip,
         };
         let (weights, rescale, bounds, _) = self.weighted(node, &layer, input)?;
         let output = self.tensor(node.output);
@@ -77,7 +77,7 @@ impl Builder<'_> {
             inputs: linear.weights.shape[1],
             groups: 1,
             normalization: None,
-            relu: linear.relu,
+            clip: linear.clip,
         };
         let (weights, rescale, bounds, wide) = self.weighted(node, &layer, input)?;
         let output = self.tensor(node.output);
@@ -181,7 +181,7 @@ impl Builder<'_> {
             multipliers: Vec::with_capacity(layer.outputs),
             shifts: Vec::with_capacity(layer.outputs),
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, layer.relu),
+            clamp: self.clamp(output, layer.clip),
             residual: QResidual::None,
         };
         let in_stream = residual.is_some_and(|r| {
