@@ -88,14 +88,15 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
-    /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, waypoint error.
+    /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, and waypoint error, or SQNR
+    /// of the logits and agreement of the classes.
     #[command(after_help = EXAMPLES)]
     Ablate {
         /// Checkpoint.
         model: PathBuf,
         #[command(flatten)]
         import: ImportArgs,
-        /// Calibration frames: a frame directory or a .safetensors file of raw inputs.
+        /// Calibration frames: a frame directory (for classifiers: of images) or a .safetensors file of raw inputs.
         #[arg(long, value_name = "FRAMES|FILE")]
         calib: PathBuf,
         #[command(flatten)]

@@ -1,6 +1,7 @@
 //! What a classifier says, for people.
 
 use super::terminal::{figure, table};
+use crate::ablation::Row;
 use crate::classification::{Accuracy, Classification, ClassificationSummary};
 use crate::run::{Output, RunReport};
 use std::fmt::Write;
@@ -54,6 +55,25 @@ pub(super) fn verify(found: &ClassificationSummary) -> String {
         let _ = writeln!(text, "only one is right      int8 on {int8} frames, f32 on {float}");
     }
     text
+}
+
+/// One line per variant of the quantizer.
+pub(super) fn ablation(rows: &[Row]) -> String {
+    let header = ["variant", "vector dB", "logits dB", "same class %", "top-1 %"].map(str::to_owned).to_vec();
+    let line = |row: &Row| {
+        let found = row.fidelity.classes.as_ref();
+        let percent = |share: Option<f64>| figure(share.map(|share| 100.0 * share), 2);
+        vec![
+            row.variant.to_owned(),
+            figure(Some(row.fidelity.vector_sqnr_db), 2),
+            figure(found.and_then(|f| f.logits_sqnr_db), 2),
+            percent(found.and_then(|f| Some(f.agreement.as_ref()?.share))),
+            percent(found.and_then(|f| Some(f.int8.as_ref()?.top1))),
+        ]
+    };
+    let float = rows.first().and_then(|row| row.fidelity.classes.as_ref()?.float.as_ref());
+    let below = float.map(|float| self::accuracy("f32", float)).unwrap_or_default();
+    format!("{}\n{below}", table(header, &[0], rows.iter().map(line)))
 }
 
 fn accuracy(network: &str, accuracy: &Accuracy) -> String {

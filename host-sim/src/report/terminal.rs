@@ -59,6 +59,9 @@ pub fn waypoints(frames: &[FrameReport]) -> String {
 
 /// One line per variant of the quantizer.
 pub fn ablation(rows: &[Row]) -> String {
+    if rows.iter().any(|row| row.fidelity.classes.is_some()) {
+        return classes::ablation(rows);
+    }
     let waypoints = rows.first().map_or(0, |row| row.fidelity.mean_mm.len());
     let numbered = |what: &str| (1..=waypoints).map(|k| format!("{what} mm {k}")).collect::<Vec<_>>();
     let header = [vec!["variant".to_owned(), "vector dB".to_owned()], numbered("mean"), numbered("worst")].concat();
