@@ -4,6 +4,7 @@
 
 use crate::ablation;
 use crate::backends::{Backend, BackendKind};
+use crate::classification::ClassGates;
 use crate::files::FrameSource;
 use crate::report::{VerifyReport, json, terminal};
 use crate::{demo, run, verify};
@@ -43,7 +44,7 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Waypoints of frames: int8 from a model image, f32 from a checkpoint.
+    /// Waypoints or classes of frames: int8 from a model image, f32 from a checkpoint.
     #[command(after_help = EXAMPLES)]
     Run {
         /// Model image (OUT.img) or checkpoint.
@@ -83,16 +84,19 @@ enum Command {
         #[arg(long, value_name = "DB")]
         min_sqnr: Option<f64>,
         #[command(flatten)]
+        class_gates: ClassGates,
+        #[command(flatten)]
         common: Common,
     },
-    /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, waypoint error.
+    /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, and waypoint error, or SQNR
+    /// of the logits and agreement of the classes.
     #[command(after_help = EXAMPLES)]
     Ablate {
         /// Checkpoint.
         model: PathBuf,
         #[command(flatten)]
         import: ImportArgs,
-        /// Calibration frames: a frame directory or a .safetensors file of raw inputs.
+        /// Calibration frames: a frame directory (for classifiers: of images) or a .safetensors file of raw inputs.
         #[arg(long, value_name = "FRAMES|FILE")]
         calib: PathBuf,
         #[command(flatten)]
@@ -189,11 +193,12 @@ impl Command {
                 console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(0)
             }
-            Self::Verify { image, model, import, frames, backend, record, mirror, min_sqnr, common } => {
+            Self::Verify { image, model, import, frames, backend, record, mirror, min_sqnr, class_gates, common } => {
                 let import = import.options()?;
                 let backend = backend.choose()?;
+                let min_sqnr_db = min_sqnr;
                 let options =
-                    verify::Options { image, record, model, import, frames, backend, mirror, min_sqnr_db: min_sqnr };
+                    verify::Options { image, record, model, import, frames, backend, mirror, min_sqnr_db, class_gates };
                 let report = verify::verify(&options, progress)?;
                 warn(&report, console);
                 console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
@@ -306,6 +311,9 @@ mod tests {
         assert!(parse("host-sim run a.img --inputs f.safetensors --json").is_ok());
         assert!(parse("host-sim run a.img").is_err());
         assert!(parse("host-sim verify a.img --frames f --inputs g").is_err());
+        assert!(parse("host-sim verify a.img --frames f --frames-limit 3 --resize 256").is_ok());
+        assert!(parse("host-sim verify a.img --frames f --frames-limit 0").is_err());
+        assert!(parse("host-sim verify a.img --frames-limit 3").is_err());
     }
 
     #[test]

@@ -11,6 +11,7 @@
 //! definition says, to the last byte, and how near that is to f32; never how to drive.
 
 use crate::backends::Backend;
+use crate::classification::ClassGates;
 use crate::files::{self, FrameSource};
 use crate::report::{VerifyReport, json, terminal};
 use crate::verify;
@@ -148,10 +149,11 @@ fn verified(bundle: &Bundle, image: PathBuf, progress: &ProgressBar) -> Result<V
         record: None,
         model: Some(bundle.checkpoint()),
         import: ImportOptions::default(),
-        frames: FrameSource { frames: Some(bundle.frames("evaluation")), inputs: None },
+        frames: FrameSource { frames: Some(bundle.frames("evaluation")), ..FrameSource::default() },
         backend: Backend::choose(None)?,
         mirror: true,
         min_sqnr_db: None,
+        class_gates: ClassGates::default(),
     };
     progress.reset();
     verify::verify(&options, progress)

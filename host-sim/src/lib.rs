@@ -2,7 +2,7 @@
 //!
 //! * [`backends`]: which of the firmware's kernels this machine can run
 //! * [`demo`]: the whole way on the files of the source tree, without arguments
-//! * [`run`]: waypoints of frames, int8 from an image or f32 from a checkpoint
+//! * [`run`]: waypoints or classes of frames, int8 from an image or f32 from a checkpoint
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
 //!   f32 network: how much precision each step costs
 //!
@@ -18,6 +18,7 @@
 pub mod ablation;
 pub mod backends;
 pub mod buffers;
+pub mod classification;
 pub mod cli;
 pub mod codes;
 pub mod compare;

@@ -1,11 +1,13 @@
 //! What a verification found: the structure, and its forms for people ([`terminal`]) and machines ([`json`]).
 
+use crate::classification::{ClassificationSummary, ClassifiedFrame};
 use crate::compare::StepDifference;
 use crate::run::{ModelInfo, Waypoints};
 use model_compiler::error::{Error, ErrorCode};
 use model_compiler::memory_plan::PlanStatus;
 use serde::Serialize;
 
+mod classes;
 pub mod json;
 pub mod terminal;
 
@@ -57,6 +59,9 @@ pub struct Summary {
     pub arena_status: PlanStatus,
     /// Size of the image.
     pub flash_bytes: u64,
+    /// Of a classifier: how often it is right, and how near to the f32 network.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub accuracy: Option<ClassificationSummary>,
 }
 
 /// Mean and maximum over the frames, mm.
@@ -121,6 +126,9 @@ pub struct FrameReport {
     pub waypoints: Option<Waypoints>,
     /// Of the f32 network.
     pub reference_waypoints: Option<Waypoints>,
+    /// What a classifier says.
+    #[serde(flatten)]
+    pub classes: Option<ClassifiedFrame>,
 }
 
 /// The step with the lowest accumulated SQNR; one that is not a number is lowest of all.
@@ -194,6 +202,7 @@ pub(crate) mod tests {
                 arena_bound_bytes: 2048,
                 arena_status: PlanStatus::Optimal,
                 flash_bytes: 4096,
+                accuracy: None,
             },
             steps: vec![step(0, Some(30.0)), step(1, Some(21.5))],
             calibration_frames: vec!["a".into()],
@@ -204,6 +213,7 @@ pub(crate) mod tests {
                 dropped_points: 0,
                 waypoints: Some(vec![[0.0, 1.0]]),
                 reference_waypoints: Some(vec![[0.0, 1.001]]),
+                classes: None,
             }],
             failure: None,
         }

@@ -1,6 +1,7 @@
 //! Proof and measure of an image: its bytes against the f64 model, its numbers against the f32 network.
 
 use crate::backends::Backend;
+use crate::classification::{ClassGates, Comparison};
 use crate::codes;
 use crate::files::{self, FrameSource, ImageFile};
 use crate::report::{FrameReport, StepReport, Summary, VerifyReport, WaypointError, worst};
@@ -38,6 +39,8 @@ pub struct Options {
     pub mirror: bool,
     /// Fail where a step's accumulated SQNR is below this, dB.
     pub min_sqnr_db: Option<f64>,
+    /// Fail where a classifier is not good enough.
+    pub class_gates: ClassGates,
 }
 
 /// Runs the comparison. Unequal bytes and missed gates are in the report ([`VerifyReport::failure`]), not errors.
@@ -62,6 +65,9 @@ pub fn verify(options: &Options, progress: &ProgressBar) -> Result<VerifyReport>
     let mut report = compare(&sources, &frames, model, progress)?;
     report.summary.flash_bytes = file.flash_bytes();
     report.check(options.min_sqnr_db);
+    let missed = options.class_gates.missed(report.summary.accuracy.as_ref())?;
+    report.failure = report.failure.or(missed);
+    report.passed = report.failure.is_none();
     Ok(report)
 }
 
@@ -94,12 +100,18 @@ pub fn compare(
     let known = calibration_digests(&record.model);
     let overlap = frames::overlap(&known, frames);
     let mut waypoint_errors = Vec::new();
+    let is_classifier = FrameFormat::of_model(&record.model).classes.is_some();
+    let mut classes = Comparison::default();
     let mut first_difference = None;
     let mut frame_reports = Vec::new();
     for frame in frames {
         progress.set_message(frame.name.clone());
         let trace = tracer.trace(frame, progress)?;
-        let report = frame_report(&record.model, frame, &trace, overlap.contains(&frame.name.as_str()));
+        let mut report = frame_report(&record.model, frame, &trace, overlap.contains(&frame.name.as_str()));
+        if is_classifier {
+            let reference = trace.reference_outputs.as_ref().map(|outputs| outputs[0].as_slice());
+            report.classes = Some(classes.add(frame, &trace.outputs[0], reference));
+        }
         add_waypoint_errors(&mut waypoint_errors, &report);
         frame_reports.push(report);
         first_difference = trace.difference;
@@ -109,6 +121,7 @@ pub fn compare(
     }
     progress.finish_and_clear();
     let steps = step_reports(record, tracer.figures());
+    let summary = Summary { accuracy: classes.summary(), ..summary(record, &steps, &waypoint_errors) };
     Ok(VerifyReport {
         schema: 1,
         model,
@@ -116,7 +129,7 @@ pub fn compare(
         passed: true,
         bytes_equal: first_difference.is_none(),
         first_difference,
-        summary: summary(record, &steps, &waypoint_errors),
+        summary,
         steps,
         calibration_frames: overlap.into_iter().map(str::to_owned).collect(),
         frames: frame_reports,
@@ -143,6 +156,7 @@ fn frame_report(model: &QModel, frame: &Frame, trace: &FrameTrace, calibration: 
         dropped_points: frame.dropped_points,
         waypoints: output.map(|i| waypoints(&trace.outputs[i])),
         reference_waypoints: output.and_then(|i| Some(waypoints(&reference?[i]))),
+        classes: None,
     }
 }
 
@@ -197,6 +211,7 @@ fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread]) ->
         arena_bound_bytes: plan.bound_bytes,
         arena_status: plan.status,
         flash_bytes: 0,
+        accuracy: None,
     }
 }
 
@@ -288,10 +303,11 @@ mod tests {
             record: None,
             model: None,
             import: ImportOptions::default(),
-            frames: FrameSource { frames: None, inputs: Some(path("inputs.safetensors")) },
+            frames: FrameSource { inputs: Some(path("inputs.safetensors")), ..FrameSource::default() },
             backend: Backend::choose(None).unwrap(),
             mirror: false,
             min_sqnr_db: None,
+            class_gates: ClassGates::default(),
         };
         (folder, options)
     }

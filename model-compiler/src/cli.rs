@@ -4,6 +4,7 @@
 
 use crate::artifact;
 use crate::error::{Error, ErrorCode, Result};
+use crate::frames::{self, FrameFormat};
 use crate::import::ImportOptions;
 use crate::ir::{Graph, Normalization};
 use crate::memory_plan::PlanOptions;
@@ -71,9 +72,11 @@ enum Command {
 
 #[derive(Debug, Args)]
 struct QuantizeArgs {
-    /// Calibration frames: a frame directory or a .safetensors file of raw inputs.
+    /// Calibration frames: a frame directory (for classifiers: of images) or a .safetensors file of raw inputs.
     #[arg(long, value_name = "FRAMES|FILE")]
     calib: Option<PathBuf>,
+    #[command(flatten)]
+    resize: ResizeArgs,
     #[command(flatten)]
     import: ImportArgs,
     /// Skip values of the ResNets: i8, i16, or a list of 16-bit stages (0 is the stem).
@@ -88,6 +91,15 @@ struct QuantizeArgs {
     /// Fastest velocity to be driven, m/s: the token streams leave room for it.
     #[arg(long, default_value_t = 10.0, value_name = "M/S", value_parser = positive)]
     max_velocity: f64,
+}
+
+/// How images of another size become a classifier's input.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Args)]
+pub struct ResizeArgs {
+    /// Scale every image of a classifier's directory to this shorter side, then crop its center; without it all have
+    /// the network's size. ImageNet networks: 256 for 224x224.
+    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u16).range(1..))]
+    pub resize: Option<u16>,
 }
 
 /// How a checkpoint or an ONNX file is read where it cannot tell.
@@ -220,7 +232,8 @@ impl QuantizeArgs {
             Error::new(ErrorCode::Usage, path.display().to_string(), "a checkpoint needs calibration frames")
                 .with_help("add --calib FRAMES (a frame directory or a .safetensors file of raw inputs)")
         })?;
-        let frames = pipeline::load_frames(&graph, calib)?;
+        let format = FrameFormat { resize: self.resize.resize, ..FrameFormat::of_graph(&graph) };
+        let frames = frames::load(calib, &format)?;
         pipeline::quantize_graph(&graph, &frames, &self.options(), &mut |s, d, t| bar.show(s, d, t))
     }
 }

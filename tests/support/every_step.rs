@@ -83,6 +83,7 @@ pub fn frames(seed: u64, count: usize) -> Vec<Frame> {
         goal: Some([2.0 - i as f64, -8.0 - 3.0 * i as f64]),
         command: None,
         dropped_points: 0,
+        label: None,
     };
     (0..count).map(frame).collect()
 }
