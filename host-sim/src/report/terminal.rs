@@ -6,6 +6,10 @@ use crate::run::{FrameResult, RunReport, Waypoints};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
 
+mod bench;
+
+pub use bench::bench;
+
 /// Waypoints of every frame.
 pub fn run(report: &RunReport) -> String {
     let longest = report.frames.iter().map(|frame| frame.waypoints.len()).max().unwrap_or(0);
