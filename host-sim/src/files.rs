@@ -11,6 +11,7 @@ use model_compiler::ir::{Graph, InputKind};
 use model_compiler::passes::PassOptions;
 use model_compiler::pipeline;
 use model_compiler::record::Record;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// A model image in memory, aligned as in flash.
@@ -26,12 +27,12 @@ impl ImageFile {
     /// # Errors
     /// The file cannot be read or is no image.
     pub fn read(path: &Path) -> Result<Self> {
-        let bytes = read(path)?;
+        let bytes = read_aligned(path).map_err(|e| Error::io(path, &e))?;
         if !is_image(&bytes) {
             let error = Error::new(ErrorCode::Malformed, path.display().to_string(), "this is no model image");
             return Err(error.with_help("model-compiler compile makes one: compile MODEL --calib FRAMES -o OUT.img"));
         }
-        Ok(Self { path: path.to_path_buf(), bytes: AlignedBytes::from(bytes.as_slice()) })
+        Ok(Self { path: path.to_path_buf(), bytes })
     }
 
     /// The image behind the bytes.
@@ -84,7 +85,6 @@ impl ImageFile {
 /// # Errors
 /// The file cannot be read.
 pub fn is_image_file(path: &Path) -> Result<bool> {
-    use std::io::Read;
     let mut start = Vec::new();
     let file = std::fs::File::open(path).map_err(|e| Error::io(path, &e))?;
     file.take(layout::MAGIC.len() as u64).read_to_end(&mut start).map_err(|e| Error::io(path, &e))?;
@@ -196,6 +196,20 @@ pub fn input_kind(port: &Port<'_>) -> Result<InputKind> {
     named.or(is_image.then_some(InputKind::Image)).ok_or_else(|| {
         Error::new(ErrorCode::Unsupported, format!("input `{}`", port.name), "no sensor gives this input")
     })
+}
+
+/// A file, without a second copy on the way; what has no length of its own (a pipe) is read to its end first.
+fn read_aligned(path: &Path) -> std::io::Result<AlignedBytes> {
+    let mut file = std::fs::File::open(path)?;
+    let metadata = file.metadata()?;
+    if !metadata.is_file() {
+        let mut bytes = Vec::new();
+        file.read_to_end(&mut bytes)?;
+        return Ok(AlignedBytes::from(bytes.as_slice()));
+    }
+    let mut bytes = AlignedBytes::zeroed(metadata.len() as usize);
+    file.read_exact(&mut bytes)?;
+    Ok(bytes)
 }
 
 fn read(path: &Path) -> Result<Vec<u8>> {

@@ -1,4 +1,4 @@
-//! The command line: `quantize`, `compile`, `inspect`.
+//! The command line: `quantize`, `compile`, `inspect`, `completions`.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
@@ -14,34 +14,33 @@ use crate::qmodel::QModel;
 use crate::quantize::{QuantizeOptions, RangeRule, SkipStages};
 use crate::target::{Target, parse_size};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use indicatif::{ProgressBar, ProgressStyle};
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+mod completions;
 mod console;
+mod examples;
 mod inspect;
+mod progress;
 
+pub use completions::CompletionArgs;
 pub use console::Console;
+use progress::Bar;
+pub use progress::progress_bar;
 
 /// Trained driving networks to int8 model images.
 #[derive(Debug, Parser)]
-#[command(version, about, after_help = EXAMPLES)]
+#[command(version, about, after_help = examples::ALL)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
 }
 
-const EXAMPLES: &str = "Examples:
-  model-compiler compile transfuser.pth --calib frames/ --target cortex-m7 -o transfuser.img
-  model-compiler quantize transfuser.pth --calib inputs.safetensors --skip i16 -o transfuser.qmodel
-  model-compiler compile transfuser.qmodel --ram 1536K --flash 128M -o transfuser.img
-  model-compiler compile resnet20.onnx --calib images/ -o resnet20.img
-  model-compiler inspect transfuser.img";
-
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Checkpoint or ONNX file to quantized model (.qmodel): integers, scales and tables, independent of any target.
+    #[command(after_help = examples::QUANTIZE)]
     Quantize {
         /// Checkpoint (.pth, .pt, .th, .safetensors) or ONNX file.
         model: PathBuf,
@@ -52,6 +51,7 @@ enum Command {
         output: PathBuf,
     },
     /// Quantized model, checkpoint or ONNX file to model image (OUT.img) and build record (OUT.record).
+    #[command(after_help = examples::COMPILE)]
     Compile {
         /// Quantized model (.qmodel), checkpoint or ONNX file.
         model: PathBuf,
@@ -64,10 +64,14 @@ enum Command {
         output: PathBuf,
     },
     /// What is in a file: image, quantized model, checkpoint or ONNX file.
+    #[command(after_help = examples::INSPECT)]
     Inspect {
         /// The file.
         file: PathBuf,
     },
+    /// Script that completes commands and options in a shell.
+    #[command(after_help = examples::COMPLETIONS)]
+    Completions(CompletionArgs),
 }
 
 #[derive(Debug, Args)]
@@ -227,11 +231,13 @@ impl QuantizeArgs {
     }
 
     fn quantized(&self, path: &Path, bar: &mut Bar) -> Result<QModel> {
+        bar.show("import", 0, 1);
         let graph = self.graph(path)?;
         let calib = self.calib.as_deref().ok_or_else(|| {
             Error::new(ErrorCode::Usage, path.display().to_string(), "a checkpoint needs calibration frames")
                 .with_help("add --calib FRAMES (a frame directory or a .safetensors file of raw inputs)")
         })?;
+        bar.show("load frames", 0, 1);
         let format = FrameFormat { resize: self.resize.resize, ..FrameFormat::of_graph(&graph) };
         let frames = frames::load(calib, &format)?;
         pipeline::quantize_graph(&graph, &frames, &self.options(), &mut |s, d, t| bar.show(s, d, t))
@@ -261,7 +267,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
             return 0;
         }
     };
-    let mut bar = Bar::new();
+    let mut bar = Bar::default();
     let result = cli.command.execute(&mut bar, &mut console);
     bar.finish();
     match result {
@@ -285,6 +291,7 @@ impl Command {
                 run_compile(model, quantize, target, output, bar, console)
             }
             Self::Inspect { file } => inspect::inspect(file),
+            Self::Completions(shell) => Ok(shell.script::<Cli>()),
         }
     }
 }
@@ -364,25 +371,28 @@ fn is_quantized(path: &Path) -> Result<bool> {
     Ok(artifact::is::<QModel>(&head))
 }
 
-/// A progress bar on standard error, drawn only on a terminal.
-struct Bar(ProgressBar);
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
 
-impl Bar {
-    fn new() -> Self {
-        let bar = ProgressBar::new(1);
-        if let Ok(style) = ProgressStyle::with_template("{msg:>10} [{bar:40}] {pos}/{len} {elapsed}") {
-            bar.set_style(style);
+    #[test]
+    fn the_definition_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn every_command_has_examples_and_they_parse() {
+        let program = Cli::command();
+        for command in std::iter::once(&program).chain(program.get_subcommands()) {
+            let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let examples: Vec<&str> = help.lines().filter_map(|line| line.strip_prefix("  ")).collect();
+            assert!(!examples.is_empty(), "{} has no examples", command.get_name());
+            for example in examples {
+                let words: Vec<&str> = example.split_whitespace().collect();
+                Cli::try_parse_from(&words).unwrap_or_else(|e| panic!("{example}: {e}"));
+                assert!(command.get_name() == "model-compiler" || words[1] == command.get_name(), "{example}");
+            }
         }
-        Self(bar)
-    }
-
-    fn show(&mut self, stage: &str, done: usize, total: usize) {
-        self.0.set_length(total as u64);
-        self.0.set_position(done as u64);
-        self.0.set_message(stage.to_owned());
-    }
-
-    fn finish(&self) {
-        self.0.finish_and_clear();
     }
 }

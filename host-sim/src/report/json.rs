@@ -2,6 +2,7 @@
 
 use super::VerifyReport;
 use crate::ablation::Row;
+use crate::bench::figures::BenchReport;
 use crate::run::RunReport;
 use model_compiler::error::Error;
 use model_compiler::memory_plan::PlanStatus;
@@ -25,6 +26,11 @@ pub fn verify(report: &VerifyReport) -> Value {
 /// Document of an ablation.
 pub fn ablation(rows: &[Row]) -> Value {
     json!({"schema": 1, "variants": to_value(&rows)})
+}
+
+/// Document of a measurement.
+pub fn bench(report: &BenchReport) -> Value {
+    to_value(report)
 }
 
 /// `{"error": {"code", "message", "where"}}`.

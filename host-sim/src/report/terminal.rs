@@ -6,6 +6,10 @@ use crate::run::{FrameResult, Output, RunReport, Waypoints};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
 
+mod bench;
+
+pub use bench::bench;
+
 /// Waypoints or classes of every frame.
 pub fn run(report: &RunReport) -> String {
     let head = format!("{} (sha256 {}…)", report.model.name, &report.model.sha256[..16]);
