@@ -15,14 +15,15 @@ use model_compiler::import::ImportOptions;
 use model_compiler::integer_reference;
 use model_compiler::ir::Graph;
 use model_compiler::reference;
-use serde::Serialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use std::path::Path;
 
 /// `[right, forward]` per future half second, m; forward is positive.
 pub type Waypoints = Vec<[f64; 2]>;
 
 /// Which network ran.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ModelInfo {
     /// Its name.
     pub name: String,
