@@ -1,8 +1,8 @@
 //! What a classifier says: the class of a frame, how often it is right, how often two networks say the same.
 
 use crate::statistics::ErrorSums;
-use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::frames::Frame;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::cmp::Ordering;
 
@@ -10,7 +10,7 @@ use std::cmp::Ordering;
 const SHORTLIST: usize = 5;
 
 /// What a network says about one frame.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Classification {
     /// The network's first output, real values: one per class.
     pub logits: Vec<f64>,
@@ -85,7 +85,7 @@ impl Share {
 }
 
 /// How often a network is right.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Accuracy {
     /// Share of the labeled frames whose label is the first class.
     pub top1: f64,
@@ -113,7 +113,7 @@ impl Accuracy {
 }
 
 /// How often two networks give the same class.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Agreement {
     /// Share of the frames.
     pub share: f64,
@@ -124,7 +124,7 @@ pub struct Agreement {
 }
 
 /// A frame as the engine and the f32 network see it.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ClassifiedFrame {
     /// Of the engine.
     #[serde(flatten)]
@@ -138,7 +138,7 @@ pub struct ClassifiedFrame {
 }
 
 /// The engine's classifier beside the f32 network; without the latter only [`Self::int8`] is known.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ClassificationSummary {
     /// Of the engine; `None` without labels.
     pub int8: Option<Accuracy>,
@@ -210,51 +210,6 @@ impl Comparison {
     }
 }
 
-/// What a classifier must reach, percent of the frames.
-#[derive(Clone, Copy, Debug, Default, PartialEq, clap::Args)]
-pub struct ClassGates {
-    /// Exit 1 where the classes of int8 and f32 agree on fewer frames.
-    #[arg(long, value_name = "PERCENT", value_parser = percent)]
-    pub min_agreement: Option<f64>,
-    /// Exit 1 where the class is the label on fewer frames.
-    #[arg(long, value_name = "PERCENT", value_parser = percent)]
-    pub min_top1: Option<f64>,
-}
-
-fn percent(text: &str) -> std::result::Result<f64, String> {
-    // A share such as 0.9 would be a gate that nothing ever misses.
-    let percent = text.parse::<f64>().ok().filter(|p| *p > 1.0 && *p <= 100.0);
-    percent.ok_or_else(|| format!("found {text:?}, expected a percentage above 1 up to 100, such as 98.5"))
-}
-
-impl ClassGates {
-    /// The first gate that is missed.
-    ///
-    /// # Errors
-    /// A gate on something that was not measured.
-    pub fn missed(&self, found: Option<&ClassificationSummary>) -> Result<Option<Error>> {
-        let agreement = found.and_then(|f| f.agreement.as_ref()).map(|a| a.share);
-        let top1 = found.and_then(|f| f.int8.as_ref()).map(|a| a.top1);
-        let gates = [
-            ("--min-agreement", "agreement of int8 and f32", self.min_agreement, agreement, "add --model MODEL"),
-            ("--min-top1", "top-1 accuracy", self.min_top1, top1, "label the frames: labels.csv, or tensor `label`"),
-        ];
-        for (option, what, gate, found, help) in gates {
-            let Some(gate) = gate else { continue };
-            let Some(found) = found else {
-                let message = format!("the {what} was not measured: it needs a classifier");
-                return Err(Error::new(ErrorCode::Usage, option, message).with_help(help));
-            };
-            let found = 100.0 * found;
-            if found < gate {
-                let message = format!("the {what} is {found:.2} %, the gate asks for {gate} %");
-                return Ok(Some(Error::new(ErrorCode::Check, option, message)));
-            }
-        }
-        Ok(None)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -322,23 +277,5 @@ mod tests {
         let seen = alone.add(&frame(None), &[1.0, 2.0], None);
         assert_eq!((seen.int8.top1, seen.reference_logits), (1, None));
         assert_eq!(alone.summary(), Some(ClassificationSummary::default()));
-    }
-
-    #[test]
-    fn gates_are_percentages_and_say_what_is_missing() {
-        let gates = |min_agreement, min_top1| ClassGates { min_agreement, min_top1 };
-        let found = compared();
-        assert_eq!(gates(Some(25.0), Some(75.0)).missed(Some(&found)).unwrap(), None);
-        let missed = gates(Some(25.5), None).missed(Some(&found)).unwrap().unwrap();
-        assert_eq!(
-            missed.to_string(),
-            "--min-agreement: the agreement of int8 and f32 is 25.00 %, the gate asks for 25.5 %"
-        );
-        assert_eq!(missed.code.exit_status(), 1);
-        assert!(gates(None, Some(76.0)).missed(Some(&found)).unwrap().unwrap().message.starts_with("the top-1"));
-        let error = gates(None, Some(50.0)).missed(Some(&ClassificationSummary::default())).unwrap_err();
-        assert_eq!((error.code, error.location.as_str()), (ErrorCode::Usage, "--min-top1"));
-        assert_eq!(ClassGates::default().missed(None).unwrap(), None);
-        assert!(percent("0.9").is_err() && percent("101").is_err() && percent("98.5") == Ok(98.5));
     }
 }

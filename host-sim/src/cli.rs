@@ -1,20 +1,24 @@
-//! The command line: `run`, `verify`, `ablate`, `bench`, and the demo without any of them.
+//! The command line: `run`, `verify`, `diff`, `ablate`, `bench`, `schema`, `completions`, and the demo without any of
+//! them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
 use crate::ablation;
 use crate::backends::{Backend, BackendKind};
-use crate::classification::ClassGates;
+use crate::diff::Diff;
 use crate::files::FrameSource;
-use crate::report::{VerifyReport, json, terminal};
+use crate::gates::{self, Gates};
+use crate::noise::{self, Selection};
+use crate::report::{self, VerifyReport, html, json, terminal};
 use crate::{bench, demo, run, verify};
 use clap::{Args, Parser, Subcommand};
 use indicatif::ProgressBar;
+use model_compiler::artifact;
 use model_compiler::cli::{CompletionArgs, ImportArgs, progress_bar};
 use model_compiler::error::{Error, ErrorCode, Result};
 use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 mod examples;
 
@@ -71,11 +75,18 @@ enum Command {
         /// Also run the mirror image of every frame (more evaluation frames, unknown to the calibration).
         #[arg(long)]
         mirror: bool,
-        /// Exit 1 where a step's SQNR against the f32 network is lower.
-        #[arg(long, value_name = "DB")]
-        min_sqnr: Option<f64>,
         #[command(flatten)]
-        class_gates: ClassGates,
+        gates: GateArgs,
+        /// Report of an earlier verification (report.json) to compare with, step by step.
+        #[arg(long, value_name = "OLD.json")]
+        baseline: Option<PathBuf>,
+        /// Write report.html and report.json to this folder.
+        #[arg(long, value_name = "DIR")]
+        report: Option<PathBuf>,
+        /// Measure the share of each tensor in the output's noise in a large network, too: of the COUNT tensors with the
+        /// lowest local SQNR [default: 64]. In a small network all of them are measured anyway.
+        #[arg(long, value_name = "COUNT", num_args = 0..=1, require_equals = true)]
+        noise_share: Option<Option<usize>>,
         #[command(flatten)]
         common: Common,
     },
@@ -98,6 +109,29 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
+    /// What changed from one report of a verification to another, without running anything.
+    #[command(after_help = examples::DIFF)]
+    Diff {
+        /// Earlier report (report.json).
+        #[arg(value_name = "OLD.json")]
+        old: PathBuf,
+        /// Later report.
+        #[arg(value_name = "NEW.json")]
+        new: PathBuf,
+        /// Exit 1 where a step lost more.
+        #[arg(long, value_name = "DB")]
+        max_loss: Option<f64>,
+        /// Write diff.html and diff.json to this folder.
+        #[arg(long, value_name = "DIR")]
+        report: Option<PathBuf>,
+        #[command(flatten)]
+        common: Common,
+    },
+    /// JSON Schema of the report that `verify --json` and report.json hold.
+    Schema {
+        #[command(flatten)]
+        common: Common,
+    },
     /// Latency of a model image per step and whole, the backends of this machine side by side.
     ///
     /// One thread, seeded inputs (no figure depends on them), backends in turns. Times are CPU time of the thread; for
@@ -116,6 +150,51 @@ enum Command {
     /// Script that completes commands and options in a shell.
     #[command(after_help = examples::COMPLETIONS)]
     Completions(CompletionArgs),
+}
+
+#[derive(Debug, Args)]
+struct GateArgs {
+    /// Exit 1 where a step's SQNR against the f32 network is lower.
+    #[arg(long, value_name = "DB")]
+    min_sqnr: Option<f64>,
+    /// Exit 1 where the first output's SQNR against the f32 network is lower.
+    #[arg(long, value_name = "DB")]
+    min_output_sqnr: Option<f64>,
+    /// Exit 1 where a step lost more against the baseline.
+    #[arg(long, value_name = "DB")]
+    max_loss: Option<f64>,
+    /// Exit 1 where the classes of int8 and f32 agree on fewer frames.
+    #[arg(long, value_name = "PERCENT", value_parser = percent)]
+    min_agreement: Option<f64>,
+    /// Exit 1 where the class is the label on fewer frames.
+    #[arg(long, value_name = "PERCENT", value_parser = percent)]
+    min_top1: Option<f64>,
+    /// Exit 1 where a limit of this file is missed: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm,
+    /// min_agreement_percent, min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, and [steps] with
+    /// "PATTERN" = dB.
+    #[arg(long, value_name = "FILE.toml")]
+    gate: Option<PathBuf>,
+}
+
+/// A percentage; a share such as 0.9 would be a gate that nothing ever misses.
+fn percent(text: &str) -> std::result::Result<f64, String> {
+    let percent = text.parse::<f64>().ok().filter(|p| gates::is_percentage(*p));
+    percent.ok_or_else(|| format!("found {text:?}, expected {}", gates::PERCENTAGE))
+}
+
+impl GateArgs {
+    fn gates(&self) -> Result<Gates> {
+        let file = self.gate.as_deref().map(Gates::read).transpose()?.unwrap_or_default();
+        let arguments = Gates {
+            min_sqnr_db: self.min_sqnr,
+            min_output_sqnr_db: self.min_output_sqnr,
+            max_loss_db: self.max_loss,
+            min_agreement_percent: self.min_agreement,
+            min_top1_percent: self.min_top1,
+            ..Gates::default()
+        };
+        Ok(arguments.or(file))
+    }
 }
 
 #[derive(Debug, Args)]
@@ -215,7 +294,7 @@ fn show(out: Option<PathBuf>, json: bool, console: &mut Console<'_>, progress: &
     };
     let report = demo::demo(&bundle, &out, progress, &mut say)?;
     if json {
-        console.print(&demo::document(&report).to_string());
+        console.print(&json::verify(&report).to_string());
     }
     Ok(conclude(&report, json, console))
 }
@@ -226,7 +305,9 @@ impl Command {
             Self::Run { common, .. }
             | Self::Verify { common, .. }
             | Self::Ablate { common, .. }
-            | Self::Bench { common, .. } => Some(common),
+            | Self::Bench { common, .. }
+            | Self::Diff { common, .. }
+            | Self::Schema { common } => Some(common),
             Self::Completions(_) => None,
         }
     }
@@ -239,13 +320,30 @@ impl Command {
                 console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(0)
             }
-            Self::Verify { image, model, import, frames, backend, record, mirror, min_sqnr, class_gates, common } => {
-                let import = import.options()?;
-                let backend = backend.choose()?;
-                let min_sqnr_db = min_sqnr;
+            Self::Verify {
+                image,
+                model,
+                import,
+                frames,
+                backend,
+                record,
+                mirror,
+                gates,
+                baseline,
+                report,
+                noise_share,
+                common,
+            } => {
+                let noise = noise_share
+                    .map_or(Selection::WhereCheap, |count| Selection::Lowest(count.unwrap_or(noise::DEFAULT_TENSORS)));
+                let (import, backend, gates) = (import.options()?, backend.choose()?, gates.gates()?);
                 let options =
-                    verify::Options { image, record, model, import, frames, backend, mirror, min_sqnr_db, class_gates };
-                let report = verify::verify(&options, progress)?;
+                    verify::Options { image, record, model, import, frames, backend, mirror, gates, baseline, noise };
+                let verified = verify::verify(&options, progress)?;
+                if let Some(folder) = &report {
+                    report::write(folder, &verified.report, &verified.frames)?;
+                }
+                let report = verified.report;
                 warn(&report, console);
                 console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
                 Ok(conclude(&report, common.json, console))
@@ -254,6 +352,14 @@ impl Command {
                 let options = ablation::Options { model, import: import.options()?, calib, frames, mirror };
                 let rows = ablation::ablate(&options, progress)?;
                 console.print(&if common.json { json::ablation(&rows).to_string() } else { terminal::ablation(&rows) });
+                Ok(0)
+            }
+            Self::Diff { old, new, max_loss, report, common } => {
+                let diff = Diff::between(&json::read(&old)?, &json::read(&new)?)?;
+                compare(&diff, max_loss, report.as_deref(), common.json, console)
+            }
+            Self::Schema { .. } => {
+                console.print(&format!("{:#}", json::schema()));
                 Ok(0)
             }
             Self::Bench { image, bench: args, common } => {
@@ -271,6 +377,37 @@ impl Command {
                 console.print(&shell.script::<Cli>());
                 Ok(0)
             }
+        }
+    }
+}
+
+/// Shows the changes between two reports and checks the gate on them.
+fn compare(
+    diff: &Diff,
+    max_loss: Option<f64>,
+    folder: Option<&Path>,
+    json: bool,
+    console: &mut Console<'_>,
+) -> Result<u8> {
+    let gates: Vec<_> = max_loss.map(|limit| gates::loss(diff, limit)).into_iter().collect();
+    let failure = gates::failure(&gates);
+    let document = json::diff(diff, &gates, failure.as_ref());
+    if let Some(folder) = folder {
+        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, &e))?;
+        let page = html::diff_page(diff, &gates);
+        artifact::write_files(&[
+            (&folder.join("diff.html"), page.as_bytes()),
+            (&folder.join("diff.json"), &json::bytes(&document)),
+        ])?;
+    }
+    console.print(&if json { document.to_string() } else { terminal::diff(diff) + &terminal::gates(&gates) });
+    match failure {
+        None => Ok(0),
+        Some(failure) => {
+            if !json {
+                console.complain(&format!("error: {failure}"));
+            }
+            Ok(failure.code.exit_status())
         }
     }
 }
@@ -413,8 +550,15 @@ mod tests {
     #[test]
     fn verify_takes_its_options() {
         let cli = parse("host-sim verify a.img --model m.pth --frames f --mirror --min-sqnr 20.5 --record r").unwrap();
-        let Some(Command::Verify { model, record, mirror, min_sqnr, .. }) = cli.command else { panic!("not verify") };
+        let Some(Command::Verify { model, record, mirror, gates, noise_share, .. }) = cli.command else {
+            panic!("not verify")
+        };
         assert_eq!((model, record), (Some("m.pth".into()), Some("r".into())));
-        assert_eq!((mirror, min_sqnr), (true, Some(20.5)));
+        assert_eq!((mirror, gates.min_sqnr, noise_share), (true, Some(20.5), None));
+        for (option, expected) in [("--noise-share", Some(None)), ("--noise-share=9", Some(Some(9)))] {
+            let cli = parse(&format!("host-sim verify a.img --frames f {option}")).unwrap();
+            let Some(Command::Verify { noise_share, .. }) = cli.command else { panic!("not verify") };
+            assert_eq!(noise_share, expected);
+        }
     }
 }

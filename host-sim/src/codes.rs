@@ -30,6 +30,34 @@ pub fn dequantize(tensor: &QTensor, codes: &[i32]) -> Vec<f32> {
     codes.iter().map(real).collect()
 }
 
+/// Lowest and highest real value that an operator can write to its output: clamp bounds, or the range of the type.
+pub fn clip_range(tensor: &QTensor, op: &QOp) -> [f64; 2] {
+    let (low, high) = match tensor.element {
+        ElementType::I8 => (i32::from(i8::MIN), i32::from(i8::MAX)),
+        ElementType::I16 => (i32::from(i16::MIN), i32::from(i16::MAX)),
+        ElementType::I32 => (i32::MIN, i32::MAX),
+        ElementType::Scratch => (0, i32::from(u8::MAX)),
+    };
+    let (low, high) = output_clamp(op).map_or((low, high), |(c, _)| (low.max(c.min.into()), high.min(c.max.into())));
+    [low, high].map(|code| tensor.scale * (f64::from(code) - f64::from(tensor.zero_point)))
+}
+
+/// Clamp and zero point of an operator's output; `None` for copies and waypoints.
+fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
+    match op {
+        QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } => Some((rescale.clamp, rescale.zero_point)),
+        QOp::AveragePool { clamp, zero_point, .. }
+        | QOp::GlobalPool { clamp, zero_point, .. }
+        | QOp::Add { clamp, zero_point, .. }
+        | QOp::Requantize { clamp, zero_point, .. }
+        | QOp::ResizeBilinear { clamp, zero_point, .. }
+        | QOp::Tokens { clamp, zero_point, .. }
+        | QOp::LayerNorm { clamp, zero_point, .. }
+        | QOp::Attention { clamp, zero_point, .. } => Some((*clamp, *zero_point)),
+        QOp::MaxPool { .. } | QOp::WaypointDecoder(_) => None,
+    }
+}
+
 /// The output bounds at which codes saturate. A lower bound equal to the zero point is a ReLU and no loss: `None`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SaturationBounds {
@@ -40,18 +68,7 @@ pub struct SaturationBounds {
 impl SaturationBounds {
     /// The bounds of an operator; `None` where its output cannot saturate (copies, waypoints).
     pub fn of(op: &QOp) -> Option<Self> {
-        let (clamp, zero_point) = match op {
-            QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } => (rescale.clamp, rescale.zero_point),
-            QOp::AveragePool { clamp, zero_point, .. }
-            | QOp::GlobalPool { clamp, zero_point, .. }
-            | QOp::Add { clamp, zero_point, .. }
-            | QOp::Requantize { clamp, zero_point, .. }
-            | QOp::ResizeBilinear { clamp, zero_point, .. }
-            | QOp::Tokens { clamp, zero_point, .. }
-            | QOp::LayerNorm { clamp, zero_point, .. }
-            | QOp::Attention { clamp, zero_point, .. } => (*clamp, *zero_point),
-            QOp::MaxPool { .. } | QOp::WaypointDecoder(_) => return None,
-        };
+        let (clamp, zero_point) = output_clamp(op)?;
         let Clamp { min, max } = clamp;
         Some(Self { min: (min != zero_point).then_some(min), max })
     }
@@ -90,6 +107,35 @@ mod tests {
             saturation_ppm: None,
         };
         assert_eq!(dequantize(&tensor, &[-128, 127]), [0.0, 127.5]);
+    }
+
+    #[test]
+    fn the_clip_range_is_that_of_the_clamp_or_of_the_type() {
+        let mut tensor = QTensor {
+            name: "t".into(),
+            value: "t".into(),
+            shape: Shape::vector(2),
+            element: ElementType::I8,
+            scale: 0.5,
+            zero_point: -128,
+            saturation_ppm: None,
+        };
+        let pool = QOp::MaxPool {
+            input: QTensorId(0),
+            output: QTensorId(1),
+            window: firmware::program::Window::square(2, 2, 0),
+        };
+        assert_eq!(clip_range(&tensor, &pool), [0.0, 127.5]);
+        let relu = QOp::Requantize {
+            input: QTensorId(0),
+            output: QTensorId(1),
+            input_zero_point: 0,
+            requant: Requant { multiplier: 1 << 23, shift: 23 },
+            zero_point: 0,
+            clamp: Clamp { min: 0, max: 127 },
+        };
+        tensor.zero_point = 0;
+        assert_eq!(clip_range(&tensor, &relu), [0.0, 63.5]);
     }
 
     #[test]

@@ -16,7 +16,8 @@ use model_compiler::import::ImportOptions;
 use model_compiler::integer_reference;
 use model_compiler::ir::{Graph, Op};
 use model_compiler::reference;
-use serde::Serialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -24,7 +25,7 @@ use std::path::Path;
 pub type Waypoints = Vec<[f64; 2]>;
 
 /// Which network ran.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ModelInfo {
     /// Its name.
     pub name: String,

@@ -15,10 +15,13 @@ mod layer_norm;
 mod linear;
 mod matmul;
 mod pool;
+mod rerun;
 mod resize_bilinear;
 mod slice;
 mod tokens;
 mod waypoint_decoder;
+
+pub use rerun::{Change, rerun};
 
 #[cfg(test)]
 mod testing;

@@ -21,7 +21,13 @@ pub const VERIFY: &str = "Examples:
   host-sim verify transfuser.img --inputs inputs.safetensors
   host-sim verify transfuser.img --model transfuser.pth --frames drive/
   host-sim verify transfuser.img --model transfuser.pth --frames drive/ --mirror --min-sqnr 20
-  host-sim verify transfuser.img --record build/transfuser.record --frames drive/ --json";
+  host-sim verify transfuser.img --record build/transfuser.record --frames drive/ --json
+  host-sim verify transfuser.img --model transfuser.pth --frames frames/ --report out/ --gate gates.toml
+  host-sim verify resnet20.img --model resnet20.onnx --frames images/ --min-agreement 98";
+
+pub const DIFF: &str = "Examples:
+  host-sim diff old/report.json new/report.json
+  host-sim diff old/report.json new/report.json --max-loss 1 --report out/";
 
 pub const ABLATE: &str = "Examples:
   host-sim ablate transfuser.pth --calib frames/ --frames drive/

@@ -2,13 +2,18 @@
 
 use super::{FrameReport, StepReport, VerifyReport, classes};
 use crate::ablation::Row;
-use crate::run::{FrameResult, Output, RunReport, Waypoints};
+use crate::diff::{Diff, FigureChange, MENTIONED_DB, StepChange};
+use crate::gates::GateOutcome;
+use crate::run::{FrameResult, ModelInfo, Output, RunReport, Waypoints};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
 
 mod bench;
 
 pub use bench::bench;
+
+/// Changed steps that a terminal shows.
+const MAX_CHANGES: usize = 20;
 
 /// Waypoints or classes of every frame.
 pub fn run(report: &RunReport) -> String {
@@ -42,7 +47,12 @@ pub fn verify(report: &VerifyReport) -> String {
     ];
     let rows = report.steps.iter().map(step_row);
     let _ = writeln!(text, "{}\n", table(header.map(str::to_owned).to_vec(), &[1, 2, 3, 4], rows));
-    text + &summary(report)
+    text += &summary(report);
+    text += &gates(&report.gates);
+    if let Some(baseline) = &report.baseline {
+        let _ = write!(text, "\nagainst the baseline: {}", diff(baseline));
+    }
+    text
 }
 
 /// Waypoints of the engine and, below, of the f32 network; frame by frame.
@@ -81,9 +91,9 @@ fn step_row(step: &StepReport) -> Vec<String> {
     vec![
         step.position.to_string(),
         step.step.clone(),
-        step.op.to_owned(),
+        step.op.clone().into_owned(),
         format!("{height}×{width}×{channels}"),
-        step.element.to_owned(),
+        step.element.clone().into_owned(),
         format!("{:.3e}", step.scale),
         figure(step.local_sqnr_db, 1),
         figure(step.sqnr_db, 1),
@@ -105,6 +115,9 @@ pub fn summary(report: &VerifyReport) -> String {
     if let (Some(step), Some(db)) = (&s.worst_step, s.worst_sqnr_db) {
         let _ = writeln!(text, "worst step             {step}: {db:.1} dB");
     }
+    if let Some(db) = s.vector_sqnr_db {
+        let _ = writeln!(text, "pooled vector          {} dB", figure(Some(db), 1));
+    }
     for (k, error) in s.waypoint_error_mm.iter().enumerate() {
         let _ = writeln!(
             text,
@@ -124,6 +137,67 @@ pub fn summary(report: &VerifyReport) -> String {
     );
     let _ = writeln!(text, "flash                  {} B", s.flash_bytes);
     text
+}
+
+/// Steps, sizes and figures that changed.
+pub fn diff(diff: &Diff) -> String {
+    let short = |model: &ModelInfo| format!("{} ({})", model.name, model.sha256.get(..12).unwrap_or(&model.sha256));
+    let mut text = format!("from {} to {}\n", short(&diff.before), short(&diff.after));
+    if !diff.same_frames {
+        text += "the two reports are about different frames\n";
+    }
+    let header = ["figure", "before", "after", "change", ""].map(str::to_owned).to_vec();
+    let digits = |unit: &str| if unit == "B" { 0 } else { 1 };
+    let row = |change: &FigureChange| {
+        let digits = digits(&change.unit);
+        let difference = change.before.zip(change.after).map(|(before, after)| after - before);
+        vec![
+            change.figure.clone(),
+            figure(change.before, digits),
+            figure(change.after, digits),
+            signed(difference, digits),
+            change.unit.clone(),
+        ]
+    };
+    let _ = writeln!(text, "\n{}\n", table(header, &[0, 4], diff.figures.iter().map(row)));
+    let changed: Vec<&StepChange> = diff.changed().collect();
+    let _ = writeln!(text, "{} of {} steps changed by {MENTIONED_DB} dB or more", changed.len(), diff.steps.len());
+    let header = ["change dB", "before", "after", "step"].map(str::to_owned).to_vec();
+    let row = |step: &&StepChange| {
+        vec![signed(step.change_db, 1), figure(step.before_db, 1), figure(step.after_db, 1), step.step.clone()]
+    };
+    if !changed.is_empty() {
+        let _ = writeln!(text, "{}", table(header, &[3], changed.iter().take(MAX_CHANGES).map(row)));
+    }
+    if changed.len() > MAX_CHANGES {
+        let _ = writeln!(text, "and {} more", changed.len() - MAX_CHANGES);
+    }
+    for (steps, which) in [(&diff.only_before, "earlier"), (&diff.only_after, "later")] {
+        if !steps.is_empty() {
+            let _ = writeln!(text, "only in the {which} report: {}", steps.join(", "));
+        }
+    }
+    text
+}
+
+/// Gates with what they met, a line each.
+pub fn gates(gates: &[GateOutcome]) -> String {
+    let line = |gate: &GateOutcome| {
+        let place = gate.place.as_ref().map(|place| format!(" ({place})")).unwrap_or_default();
+        format!("gate {} {}{place}: {}\n", gate.gate, if gate.met { "met" } else { "MISSED" }, gate.words())
+    };
+    gates.iter().map(line).collect()
+}
+
+/// A difference with its sign; a change from or to exact values is a word.
+fn signed(value: Option<f64>, digits: usize) -> String {
+    match value {
+        Some(value) if value == f64::NEG_INFINITY => "was exact".to_owned(),
+        Some(value) if value == f64::INFINITY => "now exact".to_owned(),
+        Some(value) if value.is_nan() => "lost".to_owned(),
+        Some(value) => format!("{value:+.digits$}").replace('-', "−"),
+        None => "–".to_owned(),
+    }
 }
 
 pub(super) fn figure(value: Option<f64>, digits: usize) -> String {
@@ -149,7 +223,6 @@ pub(super) fn table(header: Vec<String>, words: &[usize], rows: impl Iterator<It
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::ModelInfo;
 
     #[test]
     fn waypoints_stand_in_columns() {
@@ -192,6 +265,16 @@ mod tests {
         let words: Vec<Vec<&str>> = text.lines().map(|line| line.split_whitespace().collect()).collect();
         assert_eq!(words[0], ["frame", "network", "right", "1", "forward", "1"]);
         assert_eq!(words[1..], [vec!["a", "int8", "0.000", "1.000"], vec!["f32", "0.000", "1.001"]]);
+    }
+
+    #[test]
+    fn a_comparison_shows_losses_first_and_strangers_last() {
+        let text = diff(&crate::diff::tests::diff());
+        let lines: Vec<&str> = text.lines().map(str::trim).collect();
+        let loss = lines.iter().position(|line| line.starts_with("−1.3") && line.ends_with("conv0"));
+        let gain = lines.iter().position(|line| line.starts_with("+1.5") && line.ends_with("conv1"));
+        assert!(loss.unwrap() < gain.unwrap(), "{text}");
+        assert!(text.contains("+512") && text.contains("only in the earlier report: conv5"), "{text}");
     }
 
     #[test]

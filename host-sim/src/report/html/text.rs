@@ -1,0 +1,80 @@
+//! Figures as people read them.
+
+/// A figure with so many digits; `–` where there is none.
+pub(super) fn figure(value: Option<f64>, digits: usize) -> String {
+    match value {
+        None => "–".to_owned(),
+        Some(value) if value == f64::INFINITY => "exact".to_owned(),
+        Some(value) if value.is_nan() => "not a number".to_owned(),
+        Some(value) => format!("{value:.digits$}").replace('-', "−"),
+    }
+}
+
+/// Decibels with their unit.
+pub(super) fn decibels(value: Option<f64>) -> String {
+    match value {
+        Some(db) if db.is_finite() => format!("{} dB", figure(value, 1)),
+        _ => figure(value, 1),
+    }
+}
+
+/// A difference with its sign.
+pub(super) fn signed(value: Option<f64>, digits: usize) -> String {
+    match value {
+        Some(value) if value == f64::NEG_INFINITY => "was exact".to_owned(),
+        Some(value) if value == f64::INFINITY => "now exact".to_owned(),
+        Some(value) if value.is_finite() => format!("{value:+.digits$}").replace('-', "−"),
+        _ => figure(value, digits),
+    }
+}
+
+/// Bytes in groups of three digits.
+pub(super) fn bytes(bytes: u64) -> String {
+    let digits = bytes.to_string();
+    let groups: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|g| std::str::from_utf8(g).unwrap_or("")).collect();
+    format!("{}\u{202f}B", groups.join("\u{202f}"))
+}
+
+/// Bytes in their largest unit, for axes.
+pub(super) fn short_bytes(bytes: f64) -> String {
+    match bytes {
+        b if b >= 1_048_576.0 => {
+            format!("{:.4}", b / 1_048_576.0).trim_end_matches('0').trim_end_matches('.').to_owned() + " MiB"
+        }
+        b if b >= 1024.0 => format!("{:.1}", b / 1024.0).trim_end_matches(".0").to_owned() + " KiB",
+        b => format!("{b:.0} B"),
+    }
+}
+
+/// A real value in few characters.
+pub(super) fn value(value: f64) -> String {
+    let magnitude = value.abs();
+    let text = match magnitude {
+        0.0 => "0".to_owned(),
+        m if m >= 1e5 || m < 1e-3 => format!("{value:.1e}"),
+        m if m >= 100.0 => format!("{value:.0}"),
+        m if m >= 1.0 => format!("{value:.2}"),
+        _ => format!("{value:.4}"),
+    };
+    text.replace('-', "−")
+}
+
+/// `64×64×16`.
+pub(super) fn shape([height, width, channels]: [u16; 3]) -> String {
+    format!("{height}×{width}×{channels}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn figures_are_short_and_signs_are_signs() {
+        assert_eq!((decibels(Some(12.34)), decibels(Some(f64::INFINITY))), ("12.3 dB".into(), "exact".into()));
+        assert_eq!((figure(None, 1), figure(Some(f64::NAN), 1)), ("–".into(), "not a number".into()));
+        assert_eq!((signed(Some(-1.26), 1), signed(Some(f64::NEG_INFINITY), 1)), ("−1.3".into(), "was exact".into()));
+        assert_eq!((bytes(1_572_876), bytes(12)), ("1\u{202f}572\u{202f}876\u{202f}B".into(), "12\u{202f}B".into()));
+        assert_eq!((short_bytes(1_572_864.0), short_bytes(65_536.0)), ("1.5 MiB".into(), "64 KiB".into()));
+        assert_eq!((value(0.0), value(-0.5), value(12345.0)), ("0".into(), "−0.5000".into(), "12345".into()));
+    }
+}
