@@ -9,6 +9,7 @@
 use crate::program::{Clamp, KernelId, Requant, Window};
 use crate::tensor::{Codes, CodesMut, Shape};
 
+pub mod k4n16;
 pub mod plan;
 pub mod portable;
 #[cfg(target_arch = "x86_64")]

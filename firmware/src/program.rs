@@ -33,16 +33,19 @@ pub struct ConstRange {
 pub enum KernelId {
     /// Canonical order: weights `[output][kh][kw][input]` (`[output][input]` for linear), depth contiguous.
     Direct,
+    /// Blocks of 16 outputs × 4 depth elements: [`crate::kernels::k4n16`].
+    K4N16,
 }
 
 impl KernelId {
     /// All kernels of this format.
-    pub const ALL: &'static [Self] = &[Self::Direct];
+    pub const ALL: &'static [Self] = &[Self::Direct, Self::K4N16];
 
     /// Bit of the header's `features` word that an image with this kernel must set.
     pub const fn feature(self) -> u64 {
         1 << match self {
             Self::Direct => 32,
+            Self::K4N16 => 33,
         }
     }
 }
@@ -195,7 +198,7 @@ pub struct Conv2d {
     pub groups: u16,
     /// Packing of `weights`.
     pub kernel: KernelId,
-    /// `i8` weights, `[O][kh][kw][C/groups]` in canonical order.
+    /// `i8` weights `[O][kh][kw][C/groups]`, in the order of `kernel`.
     pub weights: ConstRange,
     /// `i8` per input channel: the code that stands for padding.
     pub padding_codes: ConstRange,
@@ -214,7 +217,7 @@ pub struct Linear {
     pub output: TensorId,
     /// Packing of `weights`.
     pub kernel: KernelId,
-    /// `i8` weights `[O][I]`.
+    /// `i8` weights `[O][I]`, in the order of `kernel`.
     pub weights: ConstRange,
     /// Accumulate in 64 bits (the compiler's bound exceeds 31 bits).
     pub wide: bool,
@@ -511,7 +514,7 @@ impl Rescale {
 
 impl Step {
     /// Union of the feature bits of all step kinds and kernels of this format.
-    pub const KNOWN_FEATURES: u64 = ((1 << 12) - 1) | KernelId::Direct.feature();
+    pub const KNOWN_FEATURES: u64 = ((1 << 12) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
 
     /// Operator name as reports print it.
     pub const fn name(&self) -> &'static str {

@@ -8,9 +8,10 @@ use crate::error::{Error, ErrorCode, Result};
 use crate::memory_plan::{MemoryPlan, Placement};
 use crate::qmodel::{Port, QModel, QOp, QRescale, QResidual, QTensorId, QTerm, QTokenSource, QWaypointDecoder};
 use firmware::image::TensorRecord;
+use firmware::kernels::{k4n16, plan};
 use firmware::program::{
-    Add, Attention, AveragePool, Conv2d, GlobalPool, KernelId, LayerNorm, Linear, MaxPool, Requantize, Rescale,
-    Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, WaypointDecoder,
+    Add, Attention, AveragePool, ConstRange, Conv2d, GlobalPool, KernelId, LayerNorm, Linear, MaxPool, Requantize,
+    Rescale, Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, WaypointDecoder,
 };
 use firmware::tensor::TensorId;
 
@@ -21,9 +22,9 @@ const ARENA_ALIGNMENT: u32 = 16;
 ///
 /// # Errors
 /// More tensors, steps or bytes than the image format can hold.
-pub fn pack(model: &QModel, plan: &MemoryPlan) -> Result<ImageParts> {
+pub fn pack(model: &QModel, memory: &MemoryPlan) -> Result<ImageParts> {
     let mut packer = Packer { constants: ConstantsBuilder::new(), tensors: Vec::new() };
-    for (tensor, placement) in model.tensors.iter().zip(&plan.tensors) {
+    for (tensor, placement) in model.tensors.iter().zip(&memory.tensors) {
         let record = TensorRecord {
             element: tensor.element,
             shape: tensor.shape,
@@ -35,10 +36,11 @@ pub fn pack(model: &QModel, plan: &MemoryPlan) -> Result<ImageParts> {
         };
         packer.tensors.push(record);
     }
-    let mut steps = Vec::with_capacity(plan.order.len());
-    for (position, &index) in plan.order.iter().enumerate() {
-        let scratch = packer.scratch(position, plan.scratch[position])?;
-        steps.push(packer.step(&model.steps[index as usize].op, scratch)?);
+    let mut steps = Vec::with_capacity(memory.order.len());
+    for (position, &index) in memory.order.iter().enumerate() {
+        let scratch = packer.scratch(position, memory.scratch[position])?;
+        let kernel = memory.kernels[position].unwrap_or(KernelId::Direct);
+        steps.push(packer.step(model, &model.steps[index as usize].op, kernel, scratch)?);
     }
     let ports = |ports: &[Port]| ports.iter().map(|port| image_port(model, port)).collect::<Result<Vec<_>>>();
     Ok(ImageParts {
@@ -48,8 +50,8 @@ pub fn pack(model: &QModel, plan: &MemoryPlan) -> Result<ImageParts> {
         constants: packer.constants.finish(),
         inputs: ports(&model.inputs)?,
         outputs: ports(&model.outputs)?,
-        arena_bytes: narrow(plan.arena_bytes, "arena bytes")?,
-        arena_alignment: ARENA_ALIGNMENT.max(plan.alignment),
+        arena_bytes: narrow(memory.arena_bytes, "arena bytes")?,
+        arena_alignment: ARENA_ALIGNMENT.max(memory.alignment),
         qmodel_digest: artifact::sha256(&artifact::to_bytes(model)?),
         build_digest: [0; 32],
         known_answer: None,
@@ -102,6 +104,20 @@ impl Packer {
         Ok(Some(id))
     }
 
+    /// Weights of `groups` groups of `outputs` output channels each, in a kernel's order.
+    fn weights(&mut self, kernel: KernelId, groups: u16, outputs: u16, weights: &[i8]) -> Result<ConstRange> {
+        match kernel {
+            KernelId::Direct => self.constants.push(weights),
+            KernelId::K4N16 => {
+                let depth = weights.len() / (usize::from(groups) * usize::from(outputs)).max(1);
+                let bytes = plan::weight_bytes(kernel, groups, outputs, depth as u64);
+                let mut packed = vec![0; narrow(bytes, "weight bytes")?];
+                k4n16::pack(weights, outputs, depth, &mut packed);
+                self.constants.push(&packed)
+            }
+        }
+    }
+
     fn rescale(&mut self, rescale: &QRescale) -> Result<Rescale> {
         Ok(Rescale {
             pre_shift: rescale.pre_shift,
@@ -122,8 +138,8 @@ impl Packer {
         })
     }
 
-    fn step(&mut self, op: &QOp, scratch: Option<TensorId>) -> Result<Step> {
-        let kernel = KernelId::Direct;
+    fn step(&mut self, model: &QModel, op: &QOp, kernel: KernelId, scratch: Option<TensorId>) -> Result<Step> {
+        let channels = |id: &QTensorId| model.tensor(*id).shape.channels;
         Ok(match op {
             QOp::Conv2d { input, output, window, groups, weights, padding_codes, rescale } => Step::Conv2d(Conv2d {
                 input: tensor_id(*input)?,
@@ -131,7 +147,7 @@ impl Packer {
                 window: *window,
                 groups: *groups,
                 kernel,
-                weights: self.constants.push(weights)?,
+                weights: self.weights(kernel, *groups, channels(output) / (*groups).max(1), weights)?,
                 padding_codes: self.constants.push(padding_codes)?,
                 rescale: self.rescale(rescale)?,
                 scratch,
@@ -140,7 +156,7 @@ impl Packer {
                 input: tensor_id(*input)?,
                 output: tensor_id(*output)?,
                 kernel,
-                weights: self.constants.push(weights)?,
+                weights: self.weights(kernel, 1, channels(output), weights)?,
                 wide: *wide,
                 rescale: self.rescale(rescale)?,
                 scratch,

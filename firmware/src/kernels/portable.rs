@@ -17,5 +17,10 @@ mod product;
 pub mod resize_bilinear;
 pub mod tokens;
 pub mod waypoint_decoder;
+mod windows;
 
 pub(crate) use axis::Axis;
+#[cfg(target_arch = "x86_64")]
+pub(crate) use codes::{Code, operand_len, take};
+#[cfg(target_arch = "x86_64")]
+pub(crate) use windows::Windows;

@@ -5,7 +5,7 @@ use crate::tensor::Codes;
 use bytemuck::{AnyBitPattern, NoUninit};
 
 /// An element type of activations.
-pub(super) trait Code: Copy + Ord {
+pub(crate) trait Code: Copy + Ord {
     /// The smallest code.
     const LOWEST: Self;
     /// Code 0.
@@ -65,7 +65,7 @@ pub(super) fn operand<T: Code>(codes: Option<Codes<'_>>, index: usize, stored: T
 }
 
 /// Elements of an operand; of one in place, `stored`.
-pub(super) fn operand_len(codes: Option<Codes<'_>>, stored: usize) -> usize {
+pub(crate) fn operand_len(codes: Option<Codes<'_>>, stored: usize) -> usize {
     match codes {
         None => stored,
         Some(Codes::I8(codes)) => codes.len(),
@@ -102,7 +102,7 @@ pub(super) fn widen<T: Code>(codes: &[T], widened: &mut [i16]) {
 }
 
 /// Takes `len` elements off the front of `scratch`; `None` where they do not fit or are not aligned.
-pub(super) fn take<'a, T: NoUninit + AnyBitPattern>(scratch: &mut &'a mut [u8], len: usize) -> Option<&'a mut [T]> {
+pub(crate) fn take<'a, T: NoUninit + AnyBitPattern>(scratch: &mut &'a mut [u8], len: usize) -> Option<&'a mut [T]> {
     let bytes = len.checked_mul(size_of::<T>())?;
     let (front, rest) = core::mem::take(scratch).split_at_mut_checked(bytes)?;
     *scratch = rest;

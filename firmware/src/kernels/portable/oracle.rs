@@ -3,8 +3,8 @@
 
 extern crate std;
 
-use crate::kernels::{RescaleArgs, ResidualArgs};
-use crate::program::{Clamp, Requant};
+use crate::kernels::{RescaleArgs, ResidualArgs, k4n16, plan};
+use crate::program::{Clamp, KernelId, Requant};
 use crate::tensor::{Codes, CodesMut, ElementType};
 use std::vec::Vec;
 
@@ -156,6 +156,16 @@ impl Scratch {
     pub(super) fn bytes(&mut self) -> &mut [u8] {
         &mut bytemuck::cast_slice_mut(&mut self.words)[..self.bytes]
     }
+}
+
+/// Weights `[groups·outputs][depth]` in a kernel's order.
+pub(super) fn pack(kernel: KernelId, weights: &[i8], groups: u16, outputs: u16, depth: usize) -> Vec<i8> {
+    if kernel == KernelId::Direct {
+        return weights.to_vec();
+    }
+    let mut packed = std::vec![0; plan::weight_bytes(kernel, groups, outputs, depth as u64) as usize];
+    k4n16::pack(weights, outputs, depth, &mut packed);
+    packed
 }
 
 /// `R(v, n)`.
