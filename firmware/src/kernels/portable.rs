@@ -5,13 +5,13 @@
 
 pub mod attention;
 mod axis;
-mod codes;
+pub(super) mod codes;
 pub mod conv2d;
 pub mod elementwise;
 pub mod layer_norm;
 pub mod linear;
 #[cfg(test)]
-mod oracle;
+pub(super) mod oracle;
 pub mod pool;
 mod product;
 pub mod resize_bilinear;

@@ -102,7 +102,7 @@ fn global_pool_into<T: Code>(channels: usize, sum: &SumArgs, terms: &[TermArgs<'
 }
 
 /// The windows of a pool in raster order of the output.
-struct Windows {
+pub(in crate::kernels) struct Windows {
     rows: Axis,
     columns: Axis,
     input_width: usize,
@@ -112,7 +112,7 @@ struct Windows {
 }
 
 /// One window: the taps that lie on the map.
-struct PoolWindow<'a> {
+pub(in crate::kernels) struct PoolWindow<'a> {
     windows: &'a Windows,
     y: usize,
     x: usize,
@@ -121,7 +121,7 @@ struct PoolWindow<'a> {
 impl Windows {
     /// `None` where the buffers do not have the lengths of the shapes (the output's may be longer) or there is nothing
     /// to do.
-    fn new(args: &PoolArgs, input_len: usize, output_len: usize) -> Option<Self> {
+    pub(in crate::kernels) fn new(args: &PoolArgs, input_len: usize, output_len: usize) -> Option<Self> {
         let (input, output) = (args.input_shape, args.output_shape);
         let fits = input.elements() == input_len as u64 && output.elements() <= output_len as u64;
         (fits && input.channels == output.channels && input.channels > 0).then(|| Self {
@@ -134,7 +134,13 @@ impl Windows {
         })
     }
 
-    fn iter(&self) -> impl Iterator<Item = PoolWindow<'_>> {
+    /// Channels of the map.
+    pub(in crate::kernels) fn channels(&self) -> usize {
+        self.channels
+    }
+
+    /// All windows.
+    pub(in crate::kernels) fn iter(&self) -> impl Iterator<Item = PoolWindow<'_>> {
         (0..self.output_height)
             .flat_map(move |y| (0..self.output_width).map(move |x| PoolWindow { windows: self, y, x }))
     }
@@ -148,13 +154,13 @@ impl Windows {
 impl PoolWindow<'_> {
     /// Input pixels that the window covers.
     #[inline]
-    fn pixels(&self) -> impl Iterator<Item = usize> {
+    pub(in crate::kernels) fn pixels(&self) -> impl Iterator<Item = usize> {
         let (width, columns) = (self.windows.input_width, self.windows.columns.taps(self.x));
         self.windows.rows.taps(self.y).flat_map(move |y| columns.clone().map(move |x| y * width + x))
     }
 
     /// Number of taps that lie on the map.
-    fn reads(&self) -> usize {
+    pub(in crate::kernels) fn reads(&self) -> usize {
         self.pixels().count()
     }
 }

@@ -80,10 +80,10 @@ fn write_pixel<I: Code, O: Code>(
 }
 
 /// The two input lines that an output line reads, each with its weight.
-struct Neighbors([(usize, i64); 2]);
+pub(in crate::kernels) struct Neighbors(pub(in crate::kernels) [(usize, i64); 2]);
 
 impl Neighbors {
-    fn new([first, weight]: [u16; 2], size: u16, weight_bits: u32) -> Self {
+    pub(in crate::kernels) fn new([first, weight]: [u16; 2], size: u16, weight_bits: u32) -> Self {
         let second = first.saturating_add(1).min(size.saturating_sub(1));
         let (one, weight) = (1 << weight_bits.min(31), i64::from(weight));
         Self([(usize::from(first), one - weight), (usize::from(second), weight)])
