@@ -3,9 +3,10 @@
 
 extern crate std;
 
-use crate::kernels::{RescaleArgs, ResidualArgs};
-use crate::program::{Clamp, Requant};
-use crate::tensor::{Codes, CodesMut, ElementType};
+use crate::fixed_point::EXP_TABLE_LEN;
+use crate::kernels::{PoolArgs, RescaleArgs, ResidualArgs};
+use crate::program::{Clamp, Requant, Window};
+use crate::tensor::{Codes, CodesMut, ElementType, Shape};
 use std::vec::Vec;
 
 /// Any code.
@@ -276,3 +277,41 @@ pub(in crate::kernels) const HOSTILE: RescaleArgs<'static> = RescaleArgs {
     clamp: Clamp { min: i16::MAX, max: i16::MIN },
     residual: ResidualArgs::Scaled { codes: None, zero_point: i16::MIN, multipliers: &[i32::MIN, i32::MIN] },
 };
+
+/// The table of [`crate::fixed_point::exp2_q15`].
+pub(in crate::kernels) fn exp_table() -> [i16; EXP_TABLE_LEN] {
+    core::array::from_fn(|k| f64::min(32767.0, (32768.0 * f64::exp2(-(k as f64) / 256.0)).round()) as i16)
+}
+
+/// `[i0, w1]` of half-pixel centers, as the compiler writes them.
+pub(in crate::kernels) fn half_pixel_lines(size: u16, output: u16, weight_bits: u32) -> Vec<[u16; 2]> {
+    let entry = |d: u16| {
+        let source = ((f64::from(d) + 0.5) * f64::from(size) / f64::from(output) - 0.5).max(0.0);
+        let first = source.floor().min(f64::from(size) - 1.0);
+        let weight = ((source - first) * f64::from(1 << weight_bits) + 0.5).floor();
+        [first as u16, weight as u16]
+    };
+    (0..output).map(entry).collect()
+}
+
+/// A random pool over a small map of up to `channels` channels; `None` where the window does not fit.
+pub(in crate::kernels) fn pool_args(rng: &mut Rng, padded: bool, channels: i64) -> Option<PoolArgs> {
+    let input_shape = Shape::map(rng.range(1, 9) as u16, rng.range(1, 9) as u16, rng.range(1, channels) as u16);
+    let mut byte = |low, high| rng.range(low, high) as u8;
+    let (kernel_h, kernel_w, stride_h, stride_w) = (byte(1, 4), byte(1, 4), byte(1, 3), byte(1, 3));
+    let mut pad = |kernel: u8| if padded { byte(0, i64::from(kernel) - 1) } else { 0 };
+    let window = Window {
+        kernel_h,
+        kernel_w,
+        stride_h,
+        stride_w,
+        pad_top: pad(kernel_h),
+        pad_bottom: pad(kernel_h),
+        pad_left: pad(kernel_w),
+        pad_right: pad(kernel_w),
+        dilation_h: 1,
+        dilation_w: 1,
+    };
+    let (height, width) = window.output_size(input_shape.height, input_shape.width)?;
+    Some(PoolArgs { input_shape, output_shape: Shape::map(height, width, input_shape.channels), window })
+}

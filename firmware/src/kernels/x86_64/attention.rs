@@ -6,7 +6,7 @@ use super::{Avx2, Avx512Vnni};
 use crate::fixed_point::{EXP_TABLE_LEN, EXPONENT_MAX, bits, saturate_i16, saturate_i32, saturate_i64};
 use crate::kernels::AttentionArgs;
 use crate::kernels::portable;
-use crate::kernels::portable::codes::{Code, block, block_mut};
+use crate::kernels::portable::codes::{Code, block, block_mut, widen};
 use crate::program::Requant;
 use crate::tensor::{CodesMut, index};
 
@@ -91,10 +91,9 @@ fn run<T: Code>(
     let size = channels / heads;
     let ending = Ending::of_requant(&args.requant);
     let (mut keys, mut values) = (Matrix::new(size), Matrix::new(tokens));
-    // Per pair of channels, then per pair of tokens: that of each row.
-    let mut queries = [[[0; 2]; ROWS]; MAX_LEN / 2];
-    let mut weights = [[[0; 2]; ROWS]; MAX_LEN / 2];
-    // Per row: `a_j`, then `e_j`, of every token; then `A_t` of every channel.
+    let mut queries = [[0; MAX_LEN]; ROWS];
+    let mut weights = [[0; MAX_LEN]; ROWS];
+    // `a_j` of every token, then `A_t` of every channel.
     let mut sums = [[0; MAX_LEN]; ROWS];
     for head in 0..heads {
         let of_head = |codes, token: usize| block(codes, token * heads + head, size).unwrap_or_default();
@@ -107,18 +106,16 @@ fn run<T: Code>(
         }
         for (group, output) in output.chunks_mut(ROWS * channels).enumerate() {
             let rows = output.len() / channels;
-            for row in 0..rows {
+            for (row, widened) in queries.iter_mut().enumerate().take(rows) {
                 match query {
-                    Some(query) => set_row(&mut queries, row, of_head(query, group * ROWS + row)),
-                    None => set_row(&mut queries, row, block(output, row * heads + head, size).unwrap_or_default()),
+                    Some(query) => widen(of_head(query, group * ROWS + row), widened),
+                    None => widen(block(output, row * heads + head, size).unwrap_or_default(), widened),
                 }
             }
             keys.multiply(product, &queries, tokens, &mut sums);
             let mut totals = [0; ROWS];
-            for (row, (total, logits)) in totals.iter_mut().zip(&mut sums).enumerate() {
-                let logits = logits.get_mut(..tokens).unwrap_or_default();
-                *total = exponential.apply(logits);
-                set_row(&mut weights, row, logits);
+            for ((total, logits), weights) in totals.iter_mut().zip(&mut sums).zip(&mut weights) {
+                *total = exponential.apply(logits.get_mut(..tokens).unwrap_or_default(), weights);
             }
             values.multiply(product, &weights, size, &mut sums);
             for (row, (total, context)) in totals.into_iter().zip(&sums).enumerate().take(rows) {
@@ -159,9 +156,9 @@ impl Exponential {
         Some(Self { exponent: args.exponent, table })
     }
 
-    /// Replaces each `a_j` (below 2^24) by `e_j` and returns S; see [`crate::fixed_point::exp2_q15`].
+    /// `e_j` of every logit `a_j`, and their sum S; see [`crate::fixed_point::exp2_q15`]. Spoils the logits.
     #[inline(always)]
-    fn apply(&self, logits: &mut [i32]) -> i32 {
+    fn apply(&self, logits: &mut [i32], weights: &mut [i16]) -> i32 {
         let peak = logits.iter().copied().max().unwrap_or(0);
         let shift = u32::from(self.exponent.shift).min(62);
         let half = (1_i64 << shift) >> 1;
@@ -170,26 +167,123 @@ impl Exponential {
             *logit = saturate_i32((distance.wrapping_add(half) >> shift).clamp(0, EXPONENT_MAX));
         }
         let mut sum = 0_i32;
-        for e in logits {
-            let [fraction, k, whole, _] = e.to_le_bytes();
+        for (e, exponent) in weights.iter_mut().zip(logits) {
+            let [fraction, k, whole, _] = exponent.to_le_bytes();
             let [here, next] = self.table[usize::from(k)].map(i32::from);
             let value = (here << 8).wrapping_sub((here - next).wrapping_mul(fraction.into()));
             let shift = 8 + u32::from(whole).min(23);
-            *e = value.wrapping_add(1 << (shift - 1)) >> shift;
-            sum = sum.wrapping_add(*e);
+            let rounded = value.wrapping_add(1 << (shift - 1)) >> shift;
+            *e = saturate_i16(rounded.into());
+            sum = sum.wrapping_add(rounded);
         }
         sum
     }
 }
 
-/// Sets one of the rows that are multiplied at once to `values`, which fit 16 bits.
-#[inline(always)]
-fn set_row<T: Copy + Into<i32>>(pairs: &mut [[Pair; ROWS]], row: usize, values: &[T]) {
-    let narrow = |value: T| saturate_i16(i64::from(value.into()));
-    let (whole, rest) = values.as_chunks();
-    let tail = rest.first().map(|last| [narrow(*last), 0]);
-    let values = whole.iter().map(|pair: &[T; 2]| pair.map(narrow)).chain(tail);
-    for (pairs, pair) in pairs.iter_mut().zip(values) {
-        pairs[row] = pair;
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use super::super::testing::{for_backends, requant};
+    use crate::kernels::plan::attention_scratch_bytes;
+    use crate::kernels::portable::oracle::{Rng, Scratch, exp_table};
+    use crate::kernels::{AttentionArgs, Kernels, Portable, RequantArgs};
+    use crate::program::Requant;
+    use crate::tensor::{CodesMut, ElementType};
+
+    fn check(kernels: &dyn Kernels, rng: &mut Rng, tokens: u32, heads: u16, size: u16) {
+        let channels = heads * size;
+        let count = tokens as usize * usize::from(channels);
+        // One in four of few different codes, so that many keys are close to the largest logit.
+        let range = if rng.next().is_multiple_of(4) { 3 } else { 127 };
+        let [query, key, value] = [(); 3].map(|()| rng.values::<i8>(count, -range - 1, range));
+        let to = rng.element_type();
+        let mut table = exp_table();
+        if rng.next().is_multiple_of(8) {
+            table.fill_with(|| rng.range(i16::MIN.into(), i16::MAX.into()) as i16);
+        }
+        let exponent = match rng.next() % 8 {
+            0 => Requant { multiplier: i32::MIN, shift: rng.range(0, 255) as u8 },
+            1 => Requant { multiplier: i32::MAX, shift: rng.range(0, 255) as u8 },
+            _ => Requant { multiplier: rng.multiplier(), shift: rng.range(10, 28) as u8 },
+        };
+        let args = AttentionArgs {
+            tokens,
+            channels,
+            heads,
+            exponent,
+            exp_table: &table,
+            requant: RequantArgs { input_zero_point: 0, ..requant(rng, ElementType::I8, 19, to) },
+        };
+        let what = std::format!("{tokens} tokens, {heads} heads of {size}, {exponent:?}");
+        let mut scratch = Scratch::new(attention_scratch_bytes(tokens, channels, heads));
+        let mut expected = rng.buffer(to, count);
+        let mut output = expected.clone();
+        Portable.attention(&args, Some(&query), &key, &value, expected.codes_mut(), scratch.bytes());
+        kernels.attention(&args, Some(&query), &key, &value, output.codes_mut(), scratch.bytes());
+        assert_eq!(output, expected, "{what}");
+        let (mut expected, mut output) = (query.clone(), query);
+        Portable.attention(&args, None, &key, &value, CodesMut::I8(&mut expected), scratch.bytes());
+        kernels.attention(&args, None, &key, &value, CodesMut::I8(&mut output), scratch.bytes());
+        assert_eq!(output, expected, "{what}, in place");
+    }
+
+    #[test]
+    fn equals_portable_apart_and_in_place() {
+        for_backends(300, |kernels, rng| {
+            let (tokens, heads, size) = (rng.range(1, 40) as u32, rng.range(1, 4) as u16, rng.range(1, 40) as u16);
+            check(kernels, rng, tokens, heads, size);
+        });
+    }
+
+    #[test]
+    fn equals_portable_at_transfusers_sizes_and_where_a_head_does_not_fit() {
+        for_backends(2, |kernels, rng| {
+            for (tokens, heads, size) in
+                [(128, 4, 16), (128, 4, 128), (127, 1, 127), (129, 1, 128), (512, 1, 32), (512, 1, 33), (3, 1, 512)]
+            {
+                check(kernels, rng, tokens, heads, size);
+            }
+        });
+    }
+
+    #[test]
+    fn hostile_lengths_give_what_portable_gives() {
+        for_backends(1, |kernels, rng| {
+            let table = exp_table();
+            let codes = [-128, 127, -128, 127, -128, 127];
+            let args = AttentionArgs {
+                tokens: 2,
+                channels: 3,
+                heads: 1,
+                exponent: Requant { multiplier: 1 << 23, shift: 20 },
+                exp_table: &table,
+                requant: requant(rng, ElementType::I8, 19, ElementType::I8),
+            };
+            for args in [
+                args,
+                AttentionArgs { heads: 0, ..args },
+                AttentionArgs { heads: 2, ..args },
+                AttentionArgs { heads: 7, ..args },
+                AttentionArgs { channels: 0, ..args },
+                AttentionArgs { tokens: 0, ..args },
+                AttentionArgs { tokens: 3, ..args },
+                AttentionArgs { tokens: u32::MAX, ..args },
+                AttentionArgs { exp_table: &[], ..args },
+            ] {
+                for (value, len) in [(&codes[..], 6), (&codes[..5], 6), (&codes[..], 5)] {
+                    let mut scratch = Scratch::new(256);
+                    let (mut expected, mut output) = ([9_i16; 6], [9_i16; 6]);
+                    let portable = CodesMut::I16(&mut expected[..len]);
+                    Portable.attention(&args, None, &codes, value, portable, scratch.bytes());
+                    kernels.attention(&args, None, &codes, value, CodesMut::I16(&mut output[..len]), scratch.bytes());
+                    assert_eq!(output, expected, "{args:?}");
+                    let (mut expected, mut output) = ([9_i8; 6], [9_i8; 6]);
+                    let portable = CodesMut::I8(&mut expected[..len]);
+                    Portable.attention(&args, None, &codes, value, portable, scratch.bytes());
+                    kernels.attention(&args, None, &codes, value, CodesMut::I8(&mut output[..len]), scratch.bytes());
+                    assert_eq!(output, expected, "{args:?}");
+                }
+            }
+        });
     }
 }

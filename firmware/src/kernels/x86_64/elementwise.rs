@@ -77,3 +77,62 @@ fn requantize_into<I: Code, O: Code>(args: &RequantArgs, input: &[I], output: &m
         *code = ending.code(i64::from(difference).wrapping_mul(args.requant.multiplier.into()));
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{code_bits, for_backends, multiplier, requant, sum, zero_point};
+    use crate::kernels::{Kernels, Portable, TermArgs};
+
+    #[test]
+    fn add_equals_portable_with_operands_apart_and_in_place() {
+        for_backends(500, |kernels, rng| {
+            let output_type = rng.element_type();
+            let len = rng.range(1, 700) as usize;
+            let in_place = [rng.flag(), rng.flag()];
+            let types = in_place.map(|in_place| if in_place { output_type } else { rng.element_type() });
+            let initial = rng.buffer(output_type, len);
+            let apart = types.map(|t| rng.buffer(t, len));
+            let terms = [0, 1].map(|k| TermArgs {
+                codes: (!in_place[k]).then(|| apart[k].codes()),
+                zero_point: zero_point(rng, types[k]),
+                multiplier: multiplier(rng),
+            });
+            let sum = sum(rng, output_type);
+            let (mut expected, mut output) = (initial.clone(), initial);
+            Portable.add(&sum, &terms, expected.codes_mut());
+            kernels.add(&sum, &terms, output.codes_mut());
+            assert_eq!(output, expected, "{sum:?} {terms:?}");
+        });
+    }
+
+    #[test]
+    fn requantize_equals_portable() {
+        for_backends(500, |kernels, rng| {
+            let (from, to) = (rng.element_type(), rng.element_type());
+            let len = rng.range(1, 300) as usize;
+            let input = rng.buffer(from, len);
+            let args = requant(rng, from, code_bits(from), to);
+            let mut expected = rng.buffer(to, len);
+            let mut output = expected.clone();
+            Portable.requantize(&args, input.codes(), expected.codes_mut());
+            kernels.requantize(&args, input.codes(), output.codes_mut());
+            assert_eq!(output, expected, "{args:?}");
+        });
+    }
+
+    #[test]
+    fn operands_of_another_length_leave_the_output_alone() {
+        for_backends(50, |kernels, rng| {
+            let (from, to) = (rng.element_type(), rng.element_type());
+            let len = rng.range(1, 40) as usize;
+            let other = rng.buffer(from, len + 1);
+            let term = |codes| TermArgs { codes, zero_point: 0, multiplier: 1 };
+            let before = rng.buffer(to, len);
+            let mut output = before.clone();
+            let end = sum(rng, to);
+            kernels.add(&end, &[term(None), term(Some(other.codes()))], output.codes_mut());
+            kernels.requantize(&requant(rng, from, 8, to), other.codes(), output.codes_mut());
+            assert_eq!(output, before);
+        });
+    }
+}

@@ -92,3 +92,49 @@ impl Statistics {
         i64::from(difference).wrapping_mul(self.reciprocal.into()).wrapping_add(half) >> self.shift
     }
 }
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use super::super::testing::{for_backends, sum};
+    use super::MAX_EPSILON;
+    use crate::kernels::portable::oracle::Buffer;
+    use crate::kernels::{Kernels, LayerNormArgs, Portable};
+    use std::vec::Vec;
+
+    #[test]
+    fn equals_portable_for_any_constants() {
+        for_backends(500, |kernels, rng| {
+            let channels = [1, 2, 7, 64, rng.range(1, 200), 1024, 1025][rng.range(0, 6) as usize] as u16;
+            let rows = rng.range(0, 4) as u32;
+            let (from, to) = (rng.element_type(), rng.element_type());
+            let count = rows as usize * usize::from(channels);
+            let input = match rng.next() % 4 {
+                0 => Buffer::I16(rng.values(count, -3, 3)),
+                1 => Buffer::I16(std::vec![rng.range(-32768, 32767) as i16; count]),
+                // Largest variance: half of the codes at either end.
+                2 => Buffer::I16((0..count).map(|i| if i % 2 == 0 { i16::MIN } else { i16::MAX }).collect()),
+                _ => rng.buffer(from, count),
+            };
+            let (gain, offset) = if rng.flag() { (1 << 24, 1 << 51) } else { (1 << 31, i64::MAX) };
+            // One in eight with an array that is too short, as in no image.
+            let missing = usize::from(rng.next().is_multiple_of(8));
+            let gains: Vec<i32> = rng.values(usize::from(channels) - missing, -gain, gain - 1);
+            let offsets: Vec<i64> = (0..channels).map(|_| rng.next() as i64 % offset).collect();
+            let epsilons = [1, rng.range(1, 1 << 30), MAX_EPSILON, MAX_EPSILON + 1, i64::MAX, i64::MIN, 0, -1];
+            let args = LayerNormArgs {
+                rows,
+                channels,
+                epsilon: epsilons[rng.range(0, 7) as usize],
+                gains: &gains,
+                offsets: &offsets,
+                sum: sum(rng, to),
+            };
+            let mut expected = rng.buffer(to, count - usize::from(rows > 0 && missing > 0));
+            let mut output = expected.clone();
+            Portable.layer_norm(&args, input.codes(), expected.codes_mut());
+            kernels.layer_norm(&args, input.codes(), output.codes_mut());
+            assert_eq!(output, expected, "{rows} x {channels}, epsilon {}, {:?}", args.epsilon, args.sum);
+        });
+    }
+}

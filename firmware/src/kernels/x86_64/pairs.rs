@@ -61,15 +61,17 @@ impl Matrix {
         }
     }
 
-    /// The product of [`ROWS`] rows, given pair by pair, with all columns: `sums[row][column]`, wrapping.
+    /// The product of [`ROWS`] rows of `depth` (even, zero behind the last) with the columns: `sums[row][column]`,
+    /// wrapping.
     #[inline(always)]
     pub(super) fn multiply<const N: usize>(
         &self,
         product: impl PairProduct,
-        rows: &[[Pair; ROWS]],
+        rows: &[[i16; N]; ROWS],
         columns: usize,
         sums: &mut [[i32; N]; ROWS],
     ) {
+        let rows = rows.each_ref().map(|row| row.as_chunks().0.get(..self.pairs).unwrap_or_default());
         let tiles = self.tiles.chunks_exact(self.pairs.max(1));
         for (tiles, first) in tiles.zip((0..columns).step_by(COLUMNS)) {
             for (sums, tile) in sums.iter_mut().zip(product.tile(tiles, rows)) {
@@ -83,7 +85,7 @@ impl Matrix {
 
 /// One or two codes, widened.
 #[inline(always)]
-pub(super) fn pair(codes: &[i8]) -> Pair {
+fn pair(codes: &[i8]) -> Pair {
     match codes {
         [first, second, ..] => [(*first).into(), (*second).into()],
         [first] => [(*first).into(), 0],
@@ -94,12 +96,12 @@ pub(super) fn pair(codes: &[i8]) -> Pair {
 /// A backend that multiplies and adds pairs.
 pub(super) trait PairProduct: Copy {
     /// `Σ_p row_p · column_p` of each row with the [`COLUMNS`] columns of consecutive tiles, wrapping.
-    fn tile(self, tiles: &[[Pair; COLUMNS]], rows: &[[Pair; ROWS]]) -> [[i32; COLUMNS]; ROWS];
+    fn tile(self, tiles: &[[Pair; COLUMNS]], rows: [&[Pair]; ROWS]) -> [[i32; COLUMNS]; ROWS];
 }
 
 impl PairProduct for Avx2 {
     #[inline(always)]
-    fn tile(self, tiles: &[[Pair; COLUMNS]], rows: &[[Pair; ROWS]]) -> [[i32; COLUMNS]; ROWS] {
+    fn tile(self, tiles: &[[Pair; COLUMNS]], rows: [&[Pair]; ROWS]) -> [[i32; COLUMNS]; ROWS] {
         // SAFETY: the token proves that this machine has AVX2.
         unsafe { tile_avx2(tiles, rows) }
     }
@@ -107,7 +109,7 @@ impl PairProduct for Avx2 {
 
 impl PairProduct for Avx512Vnni {
     #[inline(always)]
-    fn tile(self, tiles: &[[Pair; COLUMNS]], rows: &[[Pair; ROWS]]) -> [[i32; COLUMNS]; ROWS] {
+    fn tile(self, tiles: &[[Pair; COLUMNS]], rows: [&[Pair]; ROWS]) -> [[i32; COLUMNS]; ROWS] {
         // SAFETY: the token proves that this machine has AVX-512 F, VL and VNNI.
         unsafe { tile_avx512(tiles, rows) }
     }
@@ -116,17 +118,18 @@ impl PairProduct for Avx512Vnni {
 /// With AVX-512, 32 registers and a multiply-add that accumulates, which the compiler forms of the two instructions.
 #[target_feature(enable = "avx512f,avx512vl,avx512vnni")]
 #[inline]
-fn tile_avx512(tiles: &[[Pair; COLUMNS]], rows: &[[Pair; ROWS]]) -> [[i32; COLUMNS]; ROWS] {
+fn tile_avx512(tiles: &[[Pair; COLUMNS]], rows: [&[Pair]; ROWS]) -> [[i32; COLUMNS]; ROWS] {
     tile_avx2(tiles, rows)
 }
 
 #[target_feature(enable = "avx2")]
 #[inline]
-fn tile_avx2(tiles: &[[Pair; COLUMNS]], rows: &[[Pair; ROWS]]) -> [[i32; COLUMNS]; ROWS] {
+fn tile_avx2(tiles: &[[Pair; COLUMNS]], rows: [&[Pair]; ROWS]) -> [[i32; COLUMNS]; ROWS] {
     let mut sums = [[_mm256_setzero_si256(); 2]; ROWS];
-    for (tile, row_pairs) in tiles.iter().zip(rows) {
+    let [first, second, third, fourth] = rows;
+    for ((((tile, first), second), third), fourth) in tiles.iter().zip(first).zip(second).zip(third).zip(fourth) {
         let columns: [__m256i; 2] = bytemuck::cast(*tile);
-        for (sums, pair) in sums.iter_mut().zip(row_pairs) {
+        for (sums, pair) in sums.iter_mut().zip([first, second, third, fourth]) {
             let pair = _mm256_set1_epi32(bytemuck::cast(*pair));
             for (sum, columns) in sums.iter_mut().zip(columns) {
                 *sum = _mm256_add_epi32(*sum, _mm256_madd_epi16(columns, pair));

@@ -69,14 +69,14 @@ fn max_pool_into<T: Code>(args: &PoolArgs, input: Option<&[T]>, output: &mut [T]
             let len = MAX_BLOCK.min(channels - first);
             let mut best = [T::LOWEST; MAX_BLOCK];
             let source = input.unwrap_or(output);
-            for tap in window.pixels() {
+            window.pixels().for_each(|tap| {
                 let codes = source.get(tap * channels + first..).unwrap_or_default();
                 match codes.first_chunk::<MAX_BLOCK>() {
                     // Codes beyond `len` belong to the next pixel; what they give is not written.
                     Some(codes) => raise(&mut best, codes),
                     None => raise(&mut best, codes),
                 }
-            }
+            });
             let codes = output.get_mut(pixel * channels + first..).unwrap_or_default();
             for (code, best) in codes.iter_mut().zip(best).take(len) {
                 *code = best;
@@ -124,10 +124,10 @@ fn average_pool_into<I: Code, O: Code>(args: &PoolArgs, requant: &RequantArgs, i
 fn window_sums<T: Code>(window: &PoolWindow<'_>, input: &[T], first: usize, channels: usize) -> [i32; BLOCK] {
     let len = BLOCK.min(channels - first);
     let mut sums = [0; BLOCK];
-    for tap in window.pixels() {
+    window.pixels().for_each(|tap| {
         let codes = input.get(tap * channels + first..).unwrap_or_default();
         add_codes(&mut sums, codes.get(..len).unwrap_or_default());
-    }
+    });
     sums
 }
 
@@ -186,4 +186,139 @@ fn map_sums<T: Code>(map: &[T], first: usize, channels: usize) -> [i32; BLOCK] {
         add_codes(&mut sums, position.get(first..end).unwrap_or_default());
     }
     sums
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use super::super::testing::{code_bits, for_backends, multiplier, requant, sum, zero_point};
+    use super::{BLOCK, MAX_POSITIONS};
+    use crate::kernels::plan::max_pool_in_place;
+    use crate::kernels::portable::oracle::{Buffer, Rng, pool_args};
+    use crate::kernels::{Kernels, PoolArgs, Portable, RequantArgs, SumArgs, TermArgs};
+    use crate::program::{Clamp, Requant, Window};
+    use crate::tensor::{Codes, CodesMut, ElementType, Shape};
+    use std::vec::Vec;
+
+    #[test]
+    fn max_pool_equals_portable_apart_and_in_place() {
+        let in_place = core::cell::Cell::new(0);
+        for_backends(600, |kernels, rng| {
+            let Some(args) = pool_args(rng, true, 140) else { return };
+            let element_type = rng.element_type();
+            let input = rng.buffer(element_type, args.input_shape.elements() as usize);
+            let mut expected = rng.buffer(element_type, args.output_shape.elements() as usize);
+            let mut output = expected.clone();
+            Portable.max_pool(&args, Some(input.codes()), expected.codes_mut());
+            kernels.max_pool(&args, Some(input.codes()), output.codes_mut());
+            assert_eq!(output, expected, "{args:?}");
+            if max_pool_in_place(args.input_shape, args.output_shape, args.window) {
+                let (mut expected, mut output) = (input.clone(), input);
+                Portable.max_pool(&args, None, expected.codes_mut());
+                kernels.max_pool(&args, None, output.codes_mut());
+                assert_eq!(output, expected, "in place: {args:?}");
+                in_place.set(in_place.get() + 1);
+            }
+        });
+        std::println!("{} in place", in_place.get());
+    }
+
+    #[test]
+    fn average_pool_equals_portable() {
+        for_backends(400, |kernels, rng| {
+            let padded = rng.flag();
+            let Some(args) = pool_args(rng, padded, 2 * BLOCK as i64 + 20) else { return };
+            let (from, to) = (rng.element_type(), rng.element_type());
+            let input = rng.buffer(from, args.input_shape.elements() as usize);
+            let requant = requant(rng, from, code_bits(from) + 2, to);
+            let mut expected = rng.buffer(to, args.output_shape.elements() as usize);
+            let mut output = expected.clone();
+            Portable.average_pool(&args, &requant, input.codes(), expected.codes_mut());
+            kernels.average_pool(&args, &requant, input.codes(), output.codes_mut());
+            assert_eq!(output, expected, "{args:?} {requant:?}");
+        });
+    }
+
+    #[test]
+    fn global_pool_equals_portable() {
+        for_backends(300, |kernels, rng| {
+            let channels = rng.range(1, 2 * BLOCK as i64 + 20) as usize;
+            let count = rng.range(0, 2);
+            // Now and then a map that ends within a position.
+            let ragged = usize::from(rng.next().is_multiple_of(8));
+            let maps: Vec<Buffer> = (0..count)
+                .map(|_| {
+                    let (element_type, positions) = (rng.element_type(), rng.range(1, 70) as usize);
+                    rng.buffer(element_type, positions * channels + ragged)
+                })
+                .collect();
+            let terms: Vec<TermArgs<'_>> = maps
+                .iter()
+                .map(|map| TermArgs {
+                    codes: Some(map.codes()),
+                    zero_point: zero_point(rng, ElementType::I8),
+                    multiplier: multiplier(rng),
+                })
+                .collect();
+            let to = rng.element_type();
+            let sum = sum(rng, to);
+            let mut expected = rng.buffer(to, channels);
+            let mut output = expected.clone();
+            Portable.global_pool(channels as u16, &sum, &terms, expected.codes_mut());
+            kernels.global_pool(channels as u16, &sum, &terms, output.codes_mut());
+            assert_eq!(output, expected, "{sum:?} {channels} channels");
+        });
+    }
+
+    #[test]
+    fn sums_of_the_largest_maps_do_not_wrap() {
+        for_backends(1, |kernels, _| {
+            let full = Clamp { min: i16::MIN, max: i16::MAX };
+            for positions in [MAX_POSITIONS, MAX_POSITIONS + 1] {
+                for code in [i16::MIN, i16::MAX] {
+                    let map = std::vec![code; positions];
+                    let term = TermArgs { codes: Some(Codes::I16(&map)), zero_point: 0, multiplier: 1 };
+                    let sum = SumArgs { shift: 17, zero_point: 0, clamp: full };
+                    let (mut expected, mut output) = ([0], [1]);
+                    Portable.global_pool(1, &sum, &[term], CodesMut::I16(&mut expected));
+                    kernels.global_pool(1, &sum, &[term], CodesMut::I16(&mut output));
+                    assert_eq!(output, expected, "{positions} codes {code}");
+                    assert!(output[0].unsigned_abs() >= 1 << 13);
+                }
+            }
+            let shape = |size| Shape::map(size, size, 1);
+            let args = PoolArgs { input_shape: shape(255), output_shape: shape(1), window: Window::square(255, 1, 0) };
+            let map = std::vec![i16::MIN; 255 * 255];
+            let requant = Requant { multiplier: 1 << 23, shift: 40 };
+            let requant = RequantArgs { input_zero_point: 0, requant, zero_point: 0, clamp: full };
+            let mut output = [0];
+            kernels.average_pool(&args, &requant, Codes::I16(&map), CodesMut::I16(&mut output));
+            assert_eq!(output, [-16256], "-32768 · 255² / 2^17, rounded");
+        });
+    }
+
+    #[test]
+    fn hostile_shapes_give_what_portable_gives() {
+        for_backends(300, |kernels, rng| {
+            let Some(mut args) = pool_args(rng, true, 5) else { return };
+            let byte = |rng: &mut Rng| [0, 1, 2, 255][rng.range(0, 3) as usize];
+            args.window.stride_h = byte(rng);
+            args.window.dilation_w = byte(rng);
+            args.window.pad_top = byte(rng);
+            args.window.kernel_w = byte(rng);
+            args.output_shape.height = rng.range(0, 4) as u16;
+            let len = args.input_shape.elements() as usize - usize::from(rng.flag());
+            let input = rng.buffer(ElementType::I8, len);
+            let len = rng.range(0, 300) as usize;
+            let mut expected = rng.buffer(ElementType::I8, len);
+            let mut output = expected.clone();
+            Portable.max_pool(&args, Some(input.codes()), expected.codes_mut());
+            kernels.max_pool(&args, Some(input.codes()), output.codes_mut());
+            assert_eq!(output, expected, "{args:?}");
+            let requant = requant(rng, ElementType::I8, 8, ElementType::I8);
+            Portable.average_pool(&args, &requant, input.codes(), expected.codes_mut());
+            kernels.average_pool(&args, &requant, input.codes(), output.codes_mut());
+            assert_eq!(output, expected, "{args:?} {requant:?}");
+        });
+    }
 }

@@ -66,6 +66,7 @@ fn run<I: Code, O: Code>(args: &ResizeArgs<'_>, input: &[I], output: &mut [O]) {
     let channels = usize::from(args.output_shape.channels);
     let (width, input_width) = (args.columns.len(), usize::from(args.input_shape.width));
     let ending = Ending::of_sum(&args.sum);
+    let mut sums = [0; BLOCK];
     for (y, row) in args.rows.iter().enumerate() {
         let vertical = Neighbors::new(*row, args.input_shape.height, args.weight_bits);
         for (x, column) in args.columns.iter().enumerate() {
@@ -79,12 +80,12 @@ fn run<I: Code, O: Code>(args: &ResizeArgs<'_>, input: &[I], output: &mut [O]) {
             let pixel = y * width + x;
             let codes = block_mut(output, pixel, channels).unwrap_or_default();
             for (i, codes) in codes.chunks_mut(BLOCK).enumerate() {
-                let mut sums = [0; BLOCK];
-                interpolate(args, &corners, i * BLOCK, &mut sums);
+                let sums = sums.get_mut(..codes.len()).unwrap_or_default();
+                interpolate(args, &corners, i * BLOCK, sums);
                 if let Some(residual) = &args.residual {
-                    add_term(&mut sums, residual, pixel * channels + i * BLOCK, codes);
+                    add_term(sums, residual, pixel * channels + i * BLOCK, codes);
                 }
-                ending.write(&sums, codes);
+                ending.write(sums, codes);
             }
         }
     }
@@ -92,7 +93,7 @@ fn run<I: Code, O: Code>(args: &ResizeArgs<'_>, input: &[I], output: &mut [O]) {
 
 /// `t·M` for the channels `first ..` of a pixel, with `t = R(Σ wy·wx·(q − z), 2w − 8)`.
 #[inline(always)]
-fn interpolate<I: Code>(args: &ResizeArgs<'_>, corners: &[(&[I], i32); 4], first: usize, sums: &mut [i64; BLOCK]) {
+fn interpolate<I: Code>(args: &ResizeArgs<'_>, corners: &[(&[I], i32); 4], first: usize, sums: &mut [i64]) {
     let shift = 2 * args.weight_bits - 8;
     let offset = ((1_i32 << shift) >> 1) - (i32::from(args.input.zero_point) << (2 * args.weight_bits));
     let [top_left, top_right, bottom_left, bottom_right] = corners.map(|(codes, weight)| {
@@ -104,5 +105,90 @@ fn interpolate<I: Code>(args: &ResizeArgs<'_>, corners: &[(&[I], i32); 4], first
     for (sum, ((a, b), (c, d))) in sums.iter_mut().zip(top.zip(bottom)) {
         let t = a.wrapping_add(b).wrapping_add(c).wrapping_add(d).wrapping_add(offset) >> shift;
         *sum = i64::from(t).wrapping_mul(args.input.multiplier.into());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{for_backends, multiplier, sum, zero_point};
+    use super::{BLOCK, is_narrow};
+    use crate::kernels::portable::oracle::half_pixel_lines;
+    use crate::kernels::{Kernels, Portable, ResizeArgs, TermArgs};
+    use crate::tensor::{ElementType, Shape};
+    use core::cell::Cell;
+
+    #[test]
+    fn equals_portable_with_residual_apart_and_in_place() {
+        let narrow = Cell::new([0; 2]);
+        for_backends(500, |kernels, rng| {
+            let factor = [1, 2, 3, 4, 8][rng.range(0, 4) as usize];
+            let weight_bits = [4, 7, 8, 11][rng.range(0, 3) as usize];
+            let channels = [rng.range(1, 40), rng.range(1, BLOCK as i64 + 20)][rng.range(0, 1) as usize] as u16;
+            let input_shape = Shape::map(rng.range(1, 4) as u16, rng.range(1, 4) as u16, channels);
+            let output_shape =
+                Shape { height: input_shape.height * factor, width: input_shape.width * factor, ..input_shape };
+            let (from, to) = (rng.element_type(), rng.element_type());
+            let input = rng.buffer(from, input_shape.elements() as usize);
+            let in_place = rng.flag();
+            let residual_type = if in_place { to } else { rng.element_type() };
+            let residual = rng.buffer(residual_type, output_shape.elements() as usize);
+            let rows = half_pixel_lines(input_shape.height, output_shape.height, weight_bits);
+            let columns = half_pixel_lines(input_shape.width, output_shape.width, weight_bits);
+            let second = TermArgs {
+                codes: (!in_place).then(|| residual.codes()),
+                zero_point: zero_point(rng, residual_type),
+                multiplier: multiplier(rng),
+            };
+            let args = ResizeArgs {
+                input_shape,
+                output_shape,
+                input: TermArgs {
+                    codes: Some(input.codes()),
+                    zero_point: zero_point(rng, from),
+                    multiplier: multiplier(rng),
+                },
+                residual: rng.flag().then_some(second),
+                rows: &rows,
+                columns: &columns,
+                weight_bits,
+                sum: sum(rng, to),
+            };
+            let initial = if in_place { residual.clone() } else { rng.buffer(to, residual.len()) };
+            let (mut expected, mut output) = (initial.clone(), initial);
+            Portable.resize_bilinear(&args, expected.codes_mut());
+            kernels.resize_bilinear(&args, output.codes_mut());
+            assert_eq!(output, expected, "{from:?} {input_shape:?} to {to:?} {output_shape:?}, {weight_bits} bits");
+            let mut counts = narrow.get();
+            counts[usize::from(is_narrow(&args, output.len()))] += 1;
+            narrow.set(counts);
+        });
+        assert!(narrow.get() == [0; 2] || narrow.get().iter().all(|count| *count > 100), "{narrow:?}");
+    }
+
+    #[test]
+    fn hostile_lines_and_shapes_give_what_portable_gives() {
+        for_backends(400, |kernels, rng| {
+            let input = rng.buffer(ElementType::I8, 12);
+            let mut line = || [rng.range(0, 3) as u16, [0, 1, 16, 17, 65535][rng.range(0, 4) as usize]];
+            let rows = [line(), line(), line()];
+            let columns = [line(), line(), line()];
+            let term = TermArgs { codes: Some(input.codes()), zero_point: -7, multiplier: 1 << 20 };
+            let args = ResizeArgs {
+                input_shape: Shape::map(2, 2, rng.range(2, 3) as u16),
+                output_shape: Shape::map(2, rng.range(2, 3) as u16, 3),
+                input: term,
+                residual: rng.flag().then_some(TermArgs { codes: None, ..term }),
+                rows: &rows[..rng.range(1, 3) as usize],
+                columns: &columns[..rng.range(1, 3) as usize],
+                weight_bits: [0, 4, 5, 11, 12, 31, u32::MAX][rng.range(0, 6) as usize],
+                sum: sum(rng, ElementType::I8),
+            };
+            let len = rng.range(11, 18) as usize;
+            let mut expected = rng.buffer(ElementType::I8, len);
+            let mut output = expected.clone();
+            Portable.resize_bilinear(&args, expected.codes_mut());
+            kernels.resize_bilinear(&args, output.codes_mut());
+            assert_eq!(output, expected, "{args:?}");
+        });
     }
 }

@@ -86,3 +86,86 @@ fn pool<I: Code, O: Code>(
     }
     grid_h * grid_w
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::testing::{for_backends, multiplier, sum, zero_point};
+    use super::BLOCK;
+    use crate::kernels::{Kernels, Portable, TokenSourceArgs, TokensArgs};
+    use crate::tensor::Shape;
+
+    #[test]
+    fn equals_portable() {
+        for_backends(400, |kernels, rng| {
+            let channels = [rng.range(1, 40), rng.range(1, 2 * BLOCK as i64 + 20)][rng.range(0, 1) as usize] as u16;
+            let mut tokens = 0;
+            let mut grid = || {
+                let [h, w, pool_h, pool_w] = [(); 4].map(|()| rng.range(1, 4) as u16);
+                tokens += usize::from(h * w);
+                (Shape::map(h * pool_h, w * pool_w, channels), [pool_h as u8, pool_w as u8])
+            };
+            let grids = [grid(), grid()];
+            let types = [rng.element_type(), rng.element_type()];
+            let maps = [0, 1].map(|k| rng.buffer(types[k], grids[k].0.elements() as usize));
+            let sources = [0, 1].map(|k| TokenSourceArgs {
+                codes: maps[k].codes(),
+                shape: grids[k].0,
+                zero_point: zero_point(rng, types[k]),
+                pool: grids[k].1,
+                multiplier: multiplier(rng),
+            });
+            let to = rng.element_type();
+            // One in eight with an array that is too short, as in no image.
+            let missing = usize::from(rng.next().is_multiple_of(8));
+            let velocity_multipliers = rng.values(usize::from(channels) - missing, i32::MIN.into(), i32::MAX.into());
+            let position = rng.values(tokens * usize::from(channels) - missing, -32768, 32767);
+            let args = TokensArgs {
+                sources,
+                velocity: rng.range(-32768, 32767) as i16,
+                velocity_multipliers: &velocity_multipliers,
+                position: &position,
+                sum: sum(rng, to),
+            };
+            let mut expected = rng.buffer(to, tokens * usize::from(channels));
+            let mut output = expected.clone();
+            Portable.tokens(&args, expected.codes_mut());
+            kernels.tokens(&args, output.codes_mut());
+            assert_eq!(output, expected, "{grids:?}");
+        });
+    }
+
+    #[test]
+    fn hostile_shapes_give_what_portable_gives() {
+        for_backends(300, |kernels, rng| {
+            let map = rng.buffer(crate::tensor::ElementType::I16, 8);
+            let source = TokenSourceArgs {
+                codes: map.codes(),
+                shape: Shape::map(2, 2, 2),
+                zero_point: i16::MAX,
+                pool: [1, 2],
+                multiplier: i32::MIN,
+            };
+            let sources = [
+                source,
+                TokenSourceArgs { pool: [0, 255], ..source },
+                TokenSourceArgs { shape: Shape::map(65535, 65535, 65535), ..source },
+                TokenSourceArgs { shape: Shape::map(8, 1, 1), pool: [3, 1], ..source },
+                TokenSourceArgs { shape: Shape::map(2, 0, 2), ..source },
+            ];
+            let mut pick = || sources[rng.range(0, 4) as usize];
+            let sources = [pick(), pick()];
+            let len = rng.range(0, 12) as usize;
+            let position = rng.values(len, -32768, 32767);
+            let to = rng.element_type();
+            let sum = sum(rng, to);
+            let args =
+                TokensArgs { sources, velocity: i16::MIN, velocity_multipliers: &[i32::MIN], position: &position, sum };
+            let len = rng.range(0, 12) as usize;
+            let mut expected = rng.buffer(to, len);
+            let mut output = expected.clone();
+            Portable.tokens(&args, expected.codes_mut());
+            kernels.tokens(&args, output.codes_mut());
+            assert_eq!(output, expected, "{args:?}");
+        });
+    }
+}
