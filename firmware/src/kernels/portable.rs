@@ -5,13 +5,13 @@
 
 pub mod attention;
 mod axis;
-mod codes;
+pub(super) mod codes;
 pub mod conv2d;
 pub mod elementwise;
 pub mod layer_norm;
 pub mod linear;
 #[cfg(test)]
-mod oracle;
+pub(super) mod oracle;
 pub mod pool;
 mod product;
 pub mod resize_bilinear;
@@ -20,7 +20,5 @@ pub mod waypoint_decoder;
 mod windows;
 
 pub(crate) use axis::Axis;
-#[cfg(target_arch = "x86_64")]
-pub(crate) use codes::{Code, operand_len, take};
 #[cfg(target_arch = "x86_64")]
 pub(crate) use windows::Windows;

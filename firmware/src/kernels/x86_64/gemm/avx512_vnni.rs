@@ -4,7 +4,7 @@
 use super::epilogue::Epilogue;
 use super::{BLOCKS, CHANNELS, Operands, ROWS, Sums, Tile};
 use crate::kernels::k4n16::{COMPENSATION_BYTES, OUTPUTS, QUAD, QUAD_BYTES};
-use crate::kernels::portable::Code;
+use crate::kernels::portable::codes::Code;
 use crate::kernels::x86_64::Avx512Vnni;
 use core::arch::x86_64::{
     _mm512_dpbusd_epi32, _mm512_loadu_si512, _mm512_set1_epi32, _mm512_setzero_si512, _mm512_storeu_si512,
