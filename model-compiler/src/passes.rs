@@ -7,6 +7,7 @@ use crate::error::{Error, ErrorCode, Result};
 use crate::ir::Graph;
 use crate::ir::verify::verify;
 
+mod clip_before_pool;
 mod dead_code;
 #[cfg(test)]
 mod fixture;
@@ -15,6 +16,7 @@ mod fold_normalization;
 mod fuse_activation;
 mod fuse_residual;
 mod rewrite;
+mod split_concat;
 
 /// Switches of the passes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,11 +46,13 @@ pub fn optimize(graph: &mut Graph) -> Result<()> {
 /// `Numeric`: what the verifier found, such as a folded weight that exceeds the range of `f32`.
 pub fn optimize_with(graph: &mut Graph, options: PassOptions) -> Result<()> {
     type Pass<'a> = &'a dyn Fn(&mut Graph);
-    let passes: [(&str, Pass<'_>); 5] = [
+    let passes: [(&str, Pass<'_>); 7] = [
         ("fold_normalization", &fold_normalization::run),
         ("fold_batch_norm", &fold_batch_norm::run),
         ("fuse_residual", &|graph| fuse_residual::run(graph, options.fuse_residual)),
+        ("clip_before_pool", &clip_before_pool::run),
         ("fuse_activation", &fuse_activation::run),
+        ("split_concat", &split_concat::run),
         ("dead_code", &dead_code::run),
     ];
     for (name, pass) in passes {
