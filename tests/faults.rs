@@ -109,7 +109,14 @@ impl Subject {
     /// `host-sim verify IMAGE --inputs FILE --json`.
     fn verify(&self) -> Outcome {
         let arguments = ["host-sim".into(), "verify".into(), self.image.clone().into_os_string()];
-        let inputs: [OsString; 3] = ["--inputs".into(), self.inputs.clone().into_os_string(), "--json".into()];
+        let inputs: [OsString; 5] = [
+            "--inputs".into(),
+            self.inputs.clone().into_os_string(),
+            "--json".into(),
+            // The others have no faults.
+            "--backend".into(),
+            "portable".into(),
+        ];
         let (mut out, mut err) = (Vec::new(), Vec::new());
         let status = cli::main(arguments.into_iter().chain(inputs), Console { out: &mut out, err: &mut err });
         let document: Value = serde_json::from_slice(&out).expect("a JSON document");

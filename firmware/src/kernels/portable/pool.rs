@@ -154,9 +154,16 @@ impl Windows {
 impl PoolWindow<'_> {
     /// Input pixels that the window covers.
     #[inline]
-    pub(in crate::kernels) fn pixels(&self) -> impl Iterator<Item = usize> {
+    fn pixels(&self) -> impl Iterator<Item = usize> {
         let (width, columns) = (self.windows.input_width, self.windows.columns.taps(self.x));
         self.windows.rows.taps(self.y).flat_map(move |y| columns.clone().map(move |x| y * width + x))
+    }
+
+    /// Input pixel of one tap; `None` in the padding.
+    #[inline]
+    pub(in crate::kernels) fn tap(&self, row: usize, column: usize) -> Option<usize> {
+        let (y, x) = (self.windows.rows.tap(self.y, row)?, self.windows.columns.tap(self.x, column)?);
+        Some(y * self.windows.input_width + x)
     }
 
     /// Number of taps that lie on the map.

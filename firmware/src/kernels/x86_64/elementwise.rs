@@ -1,6 +1,6 @@
 //! Element-wise operators for AVX2 and AVX-512: [`portable::elementwise`] in vectors, for every type and length.
 
-use super::sums::{BLOCK, Ending, add_term};
+use super::sums::{Aligned, BLOCK, Ending, add_term};
 use crate::kernels::portable::codes::{Code, operand_len};
 use crate::kernels::{RequantArgs, SumArgs, TermArgs};
 use crate::tensor::{Codes, CodesMut};
@@ -48,11 +48,11 @@ fn add_into<T: Code>(sum: &SumArgs, terms: &[TermArgs<'_>; 2], output: &mut [T])
     }
     let ending = Ending::of_sum(sum);
     for (i, codes) in output.chunks_mut(BLOCK).enumerate() {
-        let mut sums = [0; BLOCK];
+        let mut sums = Aligned([0; BLOCK]);
         for term in terms {
-            add_term(&mut sums, term, i * BLOCK, codes);
+            add_term(&mut sums.0, term, i * BLOCK, codes);
         }
-        ending.write(&sums, codes);
+        ending.write(&sums.0, codes);
     }
 }
 

@@ -19,6 +19,7 @@ pub(super) const TILES: usize = 512;
 pub(super) type Pair = [i16; 2];
 
 /// A matrix of `2·pairs` rows and any number of columns, zero where nothing was packed.
+#[repr(align(64))]
 pub(super) struct Matrix {
     /// `[column / COLUMNS][pair][column % COLUMNS]`.
     tiles: [[Pair; COLUMNS]; TILES],

@@ -1,9 +1,9 @@
 //! Pools for AVX2 and AVX-512: [`portable::pool`] with the channels of a window in vectors.
 
-use super::sums::{BLOCK, Ending, add_codes};
+use super::sums::{Aligned, BLOCK, Ending, add_codes};
 use crate::kernels::portable;
 use crate::kernels::portable::codes::{Code, operand_len};
-use crate::kernels::portable::pool::{PoolWindow, Windows};
+use crate::kernels::portable::pool::Windows;
 use crate::kernels::{PoolArgs, RequantArgs, SumArgs, TermArgs};
 use crate::tensor::{Codes, CodesMut};
 
@@ -67,19 +67,22 @@ fn max_pool_into<T: Code>(args: &PoolArgs, input: Option<&[T]>, output: &mut [T]
     for (pixel, window) in windows.iter().enumerate() {
         for first in (0..channels).step_by(MAX_BLOCK) {
             let len = MAX_BLOCK.min(channels - first);
-            let mut best = [T::LOWEST; MAX_BLOCK];
+            let mut best = Aligned([T::LOWEST; MAX_BLOCK]);
             let source = input.unwrap_or(output);
-            window.pixels().for_each(|tap| {
-                let codes = source.get(tap * channels + first..).unwrap_or_default();
-                match codes.first_chunk::<MAX_BLOCK>() {
-                    // Codes beyond `len` belong to the next pixel; what they give is not written.
-                    Some(codes) => raise(&mut best, codes),
-                    None => raise(&mut best, codes),
+            for row in 0..usize::from(args.window.kernel_h) {
+                for column in 0..usize::from(args.window.kernel_w) {
+                    let Some(tap) = window.tap(row, column) else { continue };
+                    let codes = source.get(tap * channels + first..).unwrap_or_default();
+                    match codes.first_chunk::<MAX_BLOCK>() {
+                        // Codes beyond `len` belong to the next pixel; what they give is not written.
+                        Some(codes) => raise(&mut best.0, codes),
+                        None => raise(&mut best.0, codes),
+                    }
                 }
-            });
+            }
             let codes = output.get_mut(pixel * channels + first..).unwrap_or_default();
-            for (code, best) in codes.iter_mut().zip(best).take(len) {
-                *code = best;
+            if let (Some(codes), Some(best)) = (codes.get_mut(..len), best.0.get(..len)) {
+                codes.copy_from_slice(best);
             }
         }
     }
@@ -107,28 +110,25 @@ fn average_pool(args: &PoolArgs, requant: &RequantArgs, input: Codes<'_>, output
 fn average_pool_into<I: Code, O: Code>(args: &PoolArgs, requant: &RequantArgs, input: &[I], output: &mut [O]) {
     let Some(windows) = Windows::new(args, input.len(), output.len()) else { return };
     let ending = Ending::of_requant(requant);
-    for (pixel, window) in output.chunks_exact_mut(windows.channels()).zip(windows.iter()) {
+    let channels = windows.channels();
+    for (pixel, window) in output.chunks_exact_mut(channels).zip(windows.iter()) {
         let offset = offset(window.reads(), requant.input_zero_point);
         for (block, codes) in pixel.chunks_mut(BLOCK).enumerate() {
-            let sums = window_sums(&window, input, block * BLOCK, windows.channels());
-            for (code, sum) in codes.iter_mut().zip(sums) {
+            // At most 255·255 positions.
+            let mut sums = Aligned([0_i32; BLOCK]);
+            for row in 0..usize::from(args.window.kernel_h) {
+                for column in 0..usize::from(args.window.kernel_w) {
+                    let Some(tap) = window.tap(row, column) else { continue };
+                    let input = input.get(tap * channels + block * BLOCK..).unwrap_or_default();
+                    add_codes(&mut sums.0, input.get(..codes.len()).unwrap_or_default());
+                }
+            }
+            for (code, sum) in codes.iter_mut().zip(sums.0) {
                 let pooled = i64::from(sum).wrapping_sub(offset);
                 *code = ending.code(pooled.wrapping_mul(requant.requant.multiplier.into()));
             }
         }
     }
-}
-
-/// `Σ q` of the channels `first ..` over one window: at most 255·255 positions.
-#[inline(always)]
-fn window_sums<T: Code>(window: &PoolWindow<'_>, input: &[T], first: usize, channels: usize) -> [i32; BLOCK] {
-    let len = BLOCK.min(channels - first);
-    let mut sums = [0; BLOCK];
-    window.pixels().for_each(|tap| {
-        let codes = input.get(tap * channels + first..).unwrap_or_default();
-        add_codes(&mut sums, codes.get(..len).unwrap_or_default());
-    });
-    sums
 }
 
 /// `Σ z` over some positions.

@@ -1,6 +1,6 @@
 //! Bilinear resize for AVX2 and AVX-512: [`portable::resize_bilinear`] with the channels of a pixel in vectors.
 
-use super::sums::{BLOCK, Ending, add_term};
+use super::sums::{Aligned, BLOCK, Ending, add_term};
 use crate::fixed_point::saturate_i32;
 use crate::kernels::ResizeArgs;
 use crate::kernels::portable;
@@ -66,7 +66,7 @@ fn run<I: Code, O: Code>(args: &ResizeArgs<'_>, input: &[I], output: &mut [O]) {
     let channels = usize::from(args.output_shape.channels);
     let (width, input_width) = (args.columns.len(), usize::from(args.input_shape.width));
     let ending = Ending::of_sum(&args.sum);
-    let mut sums = [0; BLOCK];
+    let mut sums = Aligned([0; BLOCK]);
     for (y, row) in args.rows.iter().enumerate() {
         let vertical = Neighbors::new(*row, args.input_shape.height, args.weight_bits);
         for (x, column) in args.columns.iter().enumerate() {
@@ -80,7 +80,7 @@ fn run<I: Code, O: Code>(args: &ResizeArgs<'_>, input: &[I], output: &mut [O]) {
             let pixel = y * width + x;
             let codes = block_mut(output, pixel, channels).unwrap_or_default();
             for (i, codes) in codes.chunks_mut(BLOCK).enumerate() {
-                let sums = sums.get_mut(..codes.len()).unwrap_or_default();
+                let sums = sums.0.get_mut(..codes.len()).unwrap_or_default();
                 interpolate(args, &corners, i * BLOCK, sums);
                 if let Some(residual) = &args.residual {
                     add_term(sums, residual, pixel * channels + i * BLOCK, codes);

@@ -2,6 +2,10 @@
 //!
 //! A block lies in the first-level cache between its passes, so an operator is a sequence of simple loops, one per
 //! operand, whatever the types of the operands are.
+//!
+//! All loops of these kernels are plain Rust that the compiler turns into vectors of the instructions for which the
+//! function around them is compiled. So whatever holds such a loop is inlined always: a closure or function that stays
+//! apart is compiled for the least x86-64.
 
 use crate::fixed_point::clamp_code;
 use crate::kernels::portable::codes::Code;
@@ -11,6 +15,10 @@ use crate::tensor::Codes;
 
 /// Elements of a block.
 pub(super) const BLOCK: usize = 256;
+
+/// Working memory whose vectors do not straddle cache lines.
+#[repr(align(64))]
+pub(super) struct Aligned<T>(pub T);
 
 /// `clamp(offset + R(sum, n))` with its constants at hand; equal to [`crate::fixed_point::finish`].
 #[derive(Clone, Copy)]

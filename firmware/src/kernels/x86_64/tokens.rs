@@ -1,7 +1,7 @@
 //! Tokens for AVX2 and AVX-512: [`portable::tokens`] with the channels of a token in vectors.
 
 use super::pool::offset;
-use super::sums::{BLOCK, Ending, add_codes};
+use super::sums::{Aligned, BLOCK, Ending, add_codes};
 use crate::kernels::portable::codes::{Code, block, block_mut};
 use crate::kernels::{TokenSourceArgs, TokensArgs};
 use crate::tensor::{Codes, CodesMut};
@@ -71,12 +71,12 @@ fn pool<I: Code, O: Code>(
             .flat_map(|y| (tx * pool_w..(tx + 1) * pool_w).map(move |x| y * width + x))
             .filter_map(|cell| block(codes, cell, channels));
         for ((i, row), position) in row.chunks_mut(BLOCK).enumerate().zip(position.chunks(BLOCK)) {
-            let mut sums = [0_i32; BLOCK];
+            let mut sums = Aligned([0_i32; BLOCK]);
             for cell in cells.clone() {
-                add_codes(&mut sums, cell.chunks(BLOCK).nth(i).unwrap_or_default());
+                add_codes(&mut sums.0, cell.chunks(BLOCK).nth(i).unwrap_or_default());
             }
             let velocity_multipliers = args.velocity_multipliers.chunks(BLOCK).nth(i).unwrap_or_default();
-            for (channel, ((code, position), sum)) in row.iter_mut().zip(position).zip(sums).enumerate() {
+            for (channel, ((code, position), sum)) in row.iter_mut().zip(position).zip(sums.0).enumerate() {
                 let pooled = i64::from(sum).wrapping_sub(offset).wrapping_mul(source.multiplier.into());
                 let multiplier = velocity_multipliers.get(channel).copied().unwrap_or_default();
                 let velocity = i64::from(args.velocity) * i64::from(multiplier);
