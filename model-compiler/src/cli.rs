@@ -25,8 +25,8 @@ mod progress;
 
 pub use completions::CompletionArgs;
 pub use console::Console;
-pub use progress::progress_bar;
 use progress::Bar;
+pub use progress::progress_bar;
 
 /// Trained driving networks to int8 model images.
 #[derive(Debug, Parser)]

@@ -62,9 +62,10 @@ impl<'a> Tabulation<'a> {
             step.map_or_else(|| self.program[position].name().to_owned(), |step| step.name.clone())
         };
         let step = |(position, step): (usize, &Step)| {
-            let shape = self.image.tensor(step.output()).map_or([0; 3], |record| {
-                [record.shape.height, record.shape.width, record.shape.channels]
-            });
+            let shape = self
+                .image
+                .tensor(step.output())
+                .map_or([0; 3], |record| [record.shape.height, record.shape.width, record.shape.channels]);
             let macs = self.step_macs(position);
             let ms: Vec<f64> = self.medians.iter().map(|steps| steps[position]).collect();
             let times = shares(&self.names, &ms, &self.totals, macs, self.portable);
