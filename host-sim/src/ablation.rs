@@ -105,6 +105,7 @@ pub fn ablate(options: &Options, progress: &ProgressBar) -> Result<Vec<Row>> {
         evaluation.extend(evaluation.iter().map(Frame::mirrored).collect::<Vec<_>>());
     }
     progress.set_length((variants.len() * evaluation.len()) as u64);
+    progress.set_message("calibrate");
     let mut bench = Bench::new(fused, &calibration, &evaluation)?;
     let mut passes = PassOptions::default();
     let mut rows = Vec::new();
@@ -161,7 +162,7 @@ impl<'a> Bench<'a> {
     /// # Errors
     /// The quantizer refuses the choices.
     pub fn measure(&self, options: &QuantizeOptions, mut progress: impl FnMut(usize)) -> Result<Fidelity> {
-        let model = quantize(&self.graph, &self.calibration, &self.statistics, options)?;
+        let model = quantize(&self.graph, &self.calibration, &self.statistics, options, |_, _| {})?;
         let mut vectors = ErrorSums::default();
         let mut distances = Vec::new();
         let mut classes = Comparison::default();

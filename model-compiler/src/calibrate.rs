@@ -134,7 +134,8 @@ pub fn calibrate(
 }
 
 /// Mean per channel of the values that quantized activations stand for: what clipping and rounding leave of each mean.
-/// `rounded` gives the nearest representable value; `None` leaves a value's float mean.
+/// `rounded` gives the nearest representable value; `None` leaves a value's float mean. `progress` is called after each
+/// frame with the number done and the total.
 ///
 /// # Errors
 /// As [`calibrate`].
@@ -143,13 +144,14 @@ pub fn quantized_means(
     frames: &[Vec<Vec<f32>>],
     statistics: &Statistics,
     rounded: impl Fn(ValueId, f64) -> Option<f64>,
+    mut progress: impl FnMut(usize, usize),
 ) -> Result<Vec<Vec<f64>>> {
     let mut means: Vec<Vec<f64>> = statistics.values.iter().map(|v| v.channel_mean.clone()).collect();
     let is_rounded: Vec<bool> = (0..means.len()).map(|i| rounded(ValueId(i as u32), 0.0).is_some()).collect();
     for (mean, _) in means.iter_mut().zip(&is_rounded).filter(|(_, rounded)| **rounded) {
         mean.fill(0.0);
     }
-    for frame in frames {
+    for (i, frame) in frames.iter().enumerate() {
         reference::run(graph, frame, |node, data| {
             let index = node.output.0 as usize;
             if !is_rounded[index] {
@@ -162,6 +164,7 @@ pub fn quantized_means(
                 }
             }
         })?;
+        progress(i + 1, frames.len());
     }
     for (index, mean) in means.iter_mut().enumerate().filter(|(index, _)| is_rounded[*index]) {
         let per_channel = (statistics.values[index].count as f64 / mean.len() as f64).max(1.0);

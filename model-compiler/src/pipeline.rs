@@ -53,8 +53,7 @@ pub fn quantize_graph(
     let inputs = raw_inputs(graph, calibration)?;
     let statistics = calibrate(graph, &inputs, |done, total| progress("calibrate", done, total))?;
     progress("quantize", 0, 1);
-    let mut model = quantize(graph, &inputs, &statistics, options)?;
-    progress("quantize", 1, 1);
+    let mut model = quantize(graph, &inputs, &statistics, options, |done, total| progress("quantize", done, total))?;
     let digests: Vec<String> = calibration.iter().map(Frame::short_digest).collect();
     model.provenance = vec![
         ("calibration_frames".into(), digests.join(",")),
@@ -97,9 +96,9 @@ pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress:
             .with_help("this is a defect of the planner")
     })?;
     progress("plan", 1, 1);
-    progress("emit", 0, 1);
     let mut parts = pack(model, &plan)?;
-    parts.known_answer = Some(known_answer(model, &plan)?);
+    parts.known_answer = Some(known_answer(model, &plan, |done, total| progress("known answer", done, total))?);
+    progress("emit", 0, 1);
     let image = emit(&parts)?;
     target.fits(model, &plan, image.len() as u64)?;
     progress("emit", 1, 1);

@@ -123,6 +123,7 @@ impl Default for QuantizeOptions {
 }
 
 /// Quantizes an optimized graph with the statistics of its calibration frames (raw inputs per frame, in graph order).
+/// `progress` is called after each frame that the bias correction looks at with the number done and the total.
 ///
 /// # Errors
 /// An operator without an integer form, or an intermediate that exceeds its type or 2^53; the node is named.
@@ -131,12 +132,14 @@ pub fn quantize(
     frames: &[Vec<Vec<f32>>],
     statistics: &Statistics,
     options: &QuantizeOptions,
+    progress: impl FnMut(usize, usize),
 ) -> Result<QModel> {
     let types = types::assign(graph, statistics, options)?;
-    let quantized_means = calibrate::quantized_means(graph, frames, statistics, |value, x| {
+    let rounded = |value, x| {
         let stored = types.narrow(value);
         (options.bias_correction && stored.element == ElementType::I8).then(|| stored.rounded(x))
-    })?;
+    };
+    let quantized_means = calibrate::quantized_means(graph, frames, statistics, rounded, progress)?;
     let mut builder = Builder {
         graph,
         statistics,
