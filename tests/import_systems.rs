@@ -257,7 +257,7 @@ fn surplus_counters_are_no_problem_and_other_leftovers_are() {
 #[test]
 fn unfitting_options_are_refused_by_name() {
     let tensors = Network::small(System::TransFuser).tensors();
-    let heads = ImportOptions { heads: 3, ..Default::default() };
+    let heads = ImportOptions { heads: Some(3), ..Default::default() };
     let error = import("m", tensors.clone(), &heads).unwrap_err();
     assert_eq!(
         error.to_string(),

@@ -6,7 +6,7 @@ use crate::artifact;
 use crate::error::{Error, ErrorCode, Result};
 use crate::frames::{self, FrameFormat};
 use crate::import::ImportOptions;
-use crate::ir::Graph;
+use crate::ir::{Graph, Normalization};
 use crate::memory_plan::PlanOptions;
 use crate::passes::PassOptions;
 use crate::pipeline;
@@ -36,13 +36,14 @@ const EXAMPLES: &str = "Examples:
   model-compiler compile transfuser.pth --calib frames/ --target cortex-m7 -o transfuser.img
   model-compiler quantize transfuser.pth --calib inputs.safetensors --skip i16 -o transfuser.qmodel
   model-compiler compile transfuser.qmodel --ram 1536K --flash 128M -o transfuser.img
+  model-compiler compile resnet20.onnx --calib images/ -o resnet20.img
   model-compiler inspect transfuser.img";
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Checkpoint to quantized model (.qmodel): integers, scales and tables, independent of any target.
+    /// Checkpoint or ONNX file to quantized model (.qmodel): integers, scales and tables, independent of any target.
     Quantize {
-        /// Checkpoint (.pth, .pt, .th, .safetensors).
+        /// Checkpoint (.pth, .pt, .th, .safetensors) or ONNX file.
         model: PathBuf,
         #[command(flatten)]
         quantize: QuantizeArgs,
@@ -50,9 +51,9 @@ enum Command {
         #[arg(short, long, value_name = "FILE.qmodel")]
         output: PathBuf,
     },
-    /// Quantized model or checkpoint to model image (OUT.img) and build record (OUT.record).
+    /// Quantized model, checkpoint or ONNX file to model image (OUT.img) and build record (OUT.record).
     Compile {
-        /// Quantized model (.qmodel) or checkpoint.
+        /// Quantized model (.qmodel), checkpoint or ONNX file.
         model: PathBuf,
         #[command(flatten)]
         quantize: QuantizeArgs,
@@ -62,7 +63,7 @@ enum Command {
         #[arg(short, long, value_name = "OUT.img")]
         output: PathBuf,
     },
-    /// What is in a file: image, quantized model or checkpoint.
+    /// What is in a file: image, quantized model, checkpoint or ONNX file.
     Inspect {
         /// The file.
         file: PathBuf,
@@ -104,18 +105,29 @@ pub struct ResizeArgs {
     pub resize: Option<u16>,
 }
 
-/// How a checkpoint is read where its tensors cannot tell.
+/// How a checkpoint or an ONNX file is read where it cannot tell.
 #[derive(Debug, Args)]
 pub struct ImportArgs {
-    /// System; detected from the tensor names unless given.
+    /// System of a checkpoint; detected from the tensor names unless given.
     #[arg(long, value_name = "SYSTEM")]
     system: Option<String>,
-    /// Attention heads (no tensor tells).
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u16).range(1..))]
-    heads: u16,
-    /// Height and width of the network's image and BEV inputs; told from the tensors where they tell it, else 256x256.
+    /// Attention heads of a checkpoint (no tensor tells) [default: 4].
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
+    heads: Option<u16>,
+    /// Height and width of the network's image and BEV inputs; told from the file where it tells it, else 256x256 for
+    /// a checkpoint; an ONNX file of dynamic size needs it.
     #[arg(long, value_name = "HxW")]
     resolution: Option<Resolution>,
+    /// Mean of an ONNX network's image, one value or one per channel: the network reads (grey level * SCALE - MEAN) /
+    /// STD [default: ImageNet's 0.485,0.456,0.406 for RGB, 0 for grey].
+    #[arg(long, value_name = "R,G,B", value_delimiter = ',', value_parser = finite, allow_hyphen_values = true, requires = "std")]
+    mean: Option<Vec<f64>>,
+    /// Standard deviation, like --mean [default: ImageNet's 0.229,0.224,0.225 for RGB, 1 for grey].
+    #[arg(long, value_name = "R,G,B", value_delimiter = ',', value_parser = positive, requires = "mean")]
+    std: Option<Vec<f64>>,
+    /// Factor of the grey levels before --mean and --std: a number or a fraction [default: 1/255].
+    #[arg(long, value_parser = fraction, requires = "mean")]
+    scale: Option<f64>,
 }
 
 /// `HEIGHTxWIDTH`.
@@ -137,6 +149,18 @@ impl std::str::FromStr for Resolution {
 fn positive(text: &str) -> std::result::Result<f64, String> {
     let value = text.parse::<f64>().ok().filter(|v| v.is_finite() && *v > 0.0);
     value.ok_or_else(|| format!("found {text:?}, expected a positive number"))
+}
+
+fn finite(text: &str) -> std::result::Result<f64, String> {
+    text.parse::<f64>().ok().filter(|v| v.is_finite()).ok_or_else(|| format!("found {text:?}, expected a number"))
+}
+
+/// A positive number, or two of them as `A/B`.
+fn fraction(text: &str) -> std::result::Result<f64, String> {
+    match text.split_once('/') {
+        None => positive(text),
+        Some((above, below)) => Ok(positive(above)? / positive(below)?),
+    }
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -175,7 +199,15 @@ impl ImportArgs {
     pub fn options(&self) -> Result<ImportOptions> {
         let system = self.system.as_deref().map(str::parse).transpose();
         let system = system.map_err(|e: Error| e.within("--system"))?;
-        Ok(ImportOptions { system, heads: self.heads, resolution: self.resolution.map(|Resolution(h, w)| (h, w)) })
+        let resolution = self.resolution.map(|Resolution(h, w)| (h, w));
+        Ok(ImportOptions { system, heads: self.heads, resolution, normalization: self.normalization() })
+    }
+
+    /// `(x·scale − mean)/std` in grey levels.
+    fn normalization(&self) -> Option<Normalization> {
+        let scale = self.scale.unwrap_or(1.0 / 255.0);
+        let raw = |values: &[f64]| values.iter().map(|v| (v / scale) as f32).collect();
+        Some(Normalization { mean: raw(self.mean.as_ref()?), std: raw(self.std.as_ref()?) })
     }
 }
 

@@ -5,7 +5,7 @@ use crate::calibrate::calibrate;
 use crate::emit::emit;
 use crate::error::{Error, ErrorCode, Result};
 use crate::frames::{self, Frame, FrameFormat};
-use crate::import::{self, ImportOptions, checkpoint};
+use crate::import::{self, ImportOptions};
 use crate::ir::Graph;
 use crate::known_answer::known_answer;
 use crate::memory_plan::{self, PlanOptions};
@@ -20,14 +20,13 @@ use std::path::Path;
 /// Where the stages report how far they are: stage name, units done, units in all.
 pub type Progress<'a> = &'a mut dyn FnMut(&str, usize, usize);
 
-/// A checkpoint as an optimized float graph.
+/// A checkpoint or ONNX file as an optimized float graph.
 ///
 /// # Errors
-/// Unreadable file, unknown system, wrong tensors; the file is named.
+/// Those of [`import::read`]; the file is named.
 pub fn load_graph(path: &Path, import: &ImportOptions, passes: &PassOptions) -> Result<Graph> {
     let name = path.display().to_string();
-    let tensors = checkpoint::read(path)?.into();
-    let mut graph = import::import(&name, tensors, import)?;
+    let mut graph = import::read(path, import)?;
     graph.name = path.file_stem().map_or(name.clone(), |stem| stem.to_string_lossy().into_owned());
     passes::optimize_with(&mut graph, *passes).map_err(|e| e.within(name))?;
     Ok(graph)

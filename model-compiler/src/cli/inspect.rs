@@ -3,8 +3,7 @@
 use crate::artifact::{self, hex};
 use crate::emit::AlignedBytes;
 use crate::error::{Error, Result};
-use crate::import::checkpoint;
-use crate::import::{NamedTensors, System};
+use crate::import::{NamedTensors, System, checkpoint, onnx};
 use crate::qmodel::QModel;
 use crate::record::Record;
 use comfy_table::{CellAlignment, Table, presets};
@@ -25,6 +24,9 @@ pub fn inspect(path: &Path) -> Result<String> {
         artifact::from_bytes(&bytes).map(|model| qmodel(&model))
     } else if artifact::is::<Record>(&bytes) {
         artifact::from_bytes(&bytes).map(|record| build_record(&record))
+    } else if onnx::is_onnx(&bytes) {
+        let digest = hex(&artifact::sha256(&bytes));
+        onnx::Model::parse(bytes).map(|model| network(&model, &digest))
     } else {
         checkpoint::parse(&bytes).map(|checkpoint| tensors(&checkpoint))
     };
@@ -151,6 +153,33 @@ fn build_record(record: &Record) -> String {
     let (arena, bound) = (record.plan.arena_bytes, record.plan.bound_bytes);
     let _ = writeln!(text, "arena            {arena} B, bound {bound} B: {}\n", record.plan.status.words());
     text + &qmodel(&record.model)
+}
+
+fn network(model: &onnx::Model, digest: &str) -> String {
+    let mut text = String::new();
+    let (constants, values) = model.parameters();
+    let operators = model.operators();
+    let _ = writeln!(text, "ONNX model  opset {}", model.opset());
+    if !model.producer().is_empty() {
+        let _ = writeln!(text, "producer    {}", model.producer());
+    }
+    let _ = writeln!(text, "sha256      {digest}");
+    let _ = writeln!(text, "parameters  {constants} tensors, {values} values");
+    let _ = writeln!(text, "nodes       {}\n", operators.values().sum::<usize>());
+    let mut ports = table(&["port", "name", "type"], 3);
+    for (name, kind) in model.inputs() {
+        ports.add_row(["input", name, &kind]);
+    }
+    for (name, kind) in model.outputs() {
+        ports.add_row(["output", name, &kind]);
+    }
+    let _ = writeln!(text, "{ports}\n");
+    let mut nodes = table(&["operator", "nodes"], 1);
+    for (operator, count) in operators {
+        nodes.add_row([operator, count.to_string()]);
+    }
+    let _ = writeln!(text, "{nodes}");
+    text
 }
 
 fn tensors(checkpoint: &checkpoint::Checkpoint) -> String {

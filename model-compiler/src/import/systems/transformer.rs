@@ -7,6 +7,9 @@ use crate::import::NamedTensors;
 use crate::ir::{Clip, LayerNorm, Op, Tokens, ValueId, Weights};
 use std::sync::Arc;
 
+/// As published.
+const DEFAULT_HEADS: u16 = 4;
+
 pub(super) struct Transformer {
     scale: usize,
     channels: usize,
@@ -95,7 +98,7 @@ impl Transformer {
         let query = b.linear(&name("attn.query"), x, self.channels)?;
         let key = b.linear(&name("attn.key"), x, self.channels)?;
         let value = b.linear(&name("attn.value"), x, self.channels)?;
-        let attention = Op::Attention { heads: b.options.heads };
+        let attention = Op::Attention { heads: b.options.heads.unwrap_or(DEFAULT_HEADS) };
         let context = b.push(name("attn.context"), attention, &[query, key, value]);
         let context = context.map_err(|e| e.with_help("--heads sets the number of heads"))?;
         let branch = b.linear(&name("attn.proj"), context, self.channels)?;
