@@ -62,7 +62,8 @@ pub fn variants() -> Vec<Variant> {
             passes: PassOptions { fuse_residual: false },
         },
         variant("without MSE ranges", QuantizeOptions { ranges: RangeRule::MinMax, ..base.clone() }),
-        variant("without bias correction", QuantizeOptions { bias_correction: false, ..base }),
+        variant("without bias correction", QuantizeOptions { bias_correction: false, ..base.clone() }),
+        variant("without data-aware rounding", QuantizeOptions { data_aware_rounding: false, ..base }),
     ]
 }
 

@@ -89,6 +89,9 @@ struct QuantizeArgs {
     /// Clipping ranges of the i8 activations.
     #[arg(long, value_enum, default_value = "mse")]
     ranges: Ranges,
+    /// Round every weight to its nearest integer.
+    #[arg(long)]
+    no_data_aware_rounding: bool,
     /// Leave biases as they are.
     #[arg(long)]
     no_bias_correction: bool,
@@ -221,6 +224,7 @@ impl QuantizeArgs {
                 Ranges::Minmax => RangeRule::MinMax,
             },
             bias_correction: !self.no_bias_correction,
+            data_aware_rounding: !self.no_data_aware_rounding,
             max_velocity: self.max_velocity,
             ..QuantizeOptions::default()
         }

@@ -60,6 +60,7 @@ pub fn quantize_graph(
         ("skip_stages".into(), options.skip.to_string()),
         ("ranges".into(), format!("{:?}", options.ranges)),
         ("bias_correction".into(), options.bias_correction.to_string()),
+        ("data_aware_rounding".into(), options.data_aware_rounding.to_string()),
         ("wide_stream".into(), options.wide_stream.to_string()),
         ("own_pool_scale".into(), options.own_pool_scale.to_string()),
         ("max_velocity".into(), options.max_velocity.to_string()),

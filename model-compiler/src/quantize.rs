@@ -8,6 +8,7 @@ use crate::calibrate::{self, Statistics};
 use crate::error::{Error, ErrorCode, Result};
 use crate::ir::{Conv2d, Graph, Node, Op, Shape, ValueId};
 use crate::qmodel::{Bounds, Port, QModel, QOp, QStep, QTensor, QTensorId};
+use covariance::Covariances;
 use firmware::program::{Clamp, Window};
 use firmware::tensor::ElementType;
 use serde::{Deserialize, Serialize};
@@ -16,10 +17,12 @@ use std::fmt;
 
 mod bounds;
 mod copies;
+mod covariance;
 mod decoder;
 pub mod factors;
 mod moves;
 pub mod ranges;
+mod rounding;
 mod softmax;
 mod sums;
 pub mod tables;
@@ -101,6 +104,8 @@ pub struct QuantizeOptions {
     pub ranges: RangeRule,
     /// Correct biases for the mean error of quantized weights.
     pub bias_correction: bool,
+    /// Round weights so that their errors cancel on the calibration frames, where these say enough about a layer.
+    pub data_aware_rounding: bool,
     /// Residual stream of the transformers in 16 bits.
     pub wide_stream: bool,
     /// Global pools get a scale of their own instead of their input's.
@@ -115,6 +120,7 @@ impl Default for QuantizeOptions {
             skip: SkipStages::narrow(),
             ranges: RangeRule::Mse,
             bias_correction: true,
+            data_aware_rounding: true,
             wide_stream: true,
             own_pool_scale: true,
             max_velocity: 10.0,
@@ -140,10 +146,15 @@ pub fn quantize(
         (options.bias_correction && stored.element == ElementType::I8).then(|| stored.rounded(x))
     };
     let quantized_means = calibrate::quantized_means(graph, frames, statistics, rounded, progress)?;
+    let covariances = match options.data_aware_rounding {
+        true => Covariances::measure(graph, frames, &types)?,
+        false => Covariances::default(),
+    };
     let mut builder = Builder {
         graph,
         statistics,
         quantized_means,
+        covariances,
         options,
         types,
         model: QModel {
@@ -174,6 +185,8 @@ struct Builder<'a> {
     statistics: &'a Statistics,
     /// Mean per channel of each value as the layers read it.
     quantized_means: Vec<Vec<f64>>,
+    /// How what the layers read varies.
+    covariances: Covariances,
     options: &'a QuantizeOptions,
     types: types::Types,
     model: QModel,

@@ -59,9 +59,14 @@ impl Stored {
 
     /// The representable real value nearest to `x`.
     pub fn rounded(&self, x: f64) -> f64 {
+        self.code(x) * self.scale
+    }
+
+    /// The same in units of the scale: `q − z`, an integer.
+    pub fn code(&self, x: f64) -> f64 {
         let (min, max) = super::code_range(self.element);
         let z = f64::from(self.zero_point);
-        (round(x / self.scale + z).clamp(f64::from(min), f64::from(max)) - z) * self.scale
+        round(x / self.scale + z).clamp(f64::from(min), f64::from(max)) - z
     }
 
     fn fixed(element: ElementType, scale: f64, zero_point: i32) -> Self {

@@ -1,9 +1,10 @@
 //! Convolutions and linear layers: i8 weights per output channel, effective bias, epilogue.
 
 use super::factors::{self, Factor, bits, round};
+use super::rounding::Rounding;
 use super::{Builder, bounds_of};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Clip, Conv2d, Linear, Node, Normalization, ValueId, Weights};
+use crate::ir::{Clip, Conv2d, Linear, Node, Normalization, Weights};
 use crate::qmodel::{Bounds, QOp, QRescale, QResidual, QTensorId};
 use firmware::tensor::ElementType;
 use std::sync::Arc;
@@ -100,7 +101,7 @@ impl Builder<'_> {
     ) -> Result<(Vec<i8>, QRescale, Bounds, bool)> {
         let output = self.tensor(node.output);
         let residual = node.inputs.get(1).map(|&value| self.tensor(value));
-        let integer = self.integer_layer(node.inputs[0], layer, input, output)?;
+        let integer = self.integer_layer(node, layer, input, output)?;
         let (rescale, mut bounds) = self.rescale(layer, &integer, input, output, residual)?;
         let half = f64::exp2(f64::from(rescale.pre_shift)) / 2.0;
         let accumulator_bits = bits(integer.partial_bound + half);
@@ -122,17 +123,22 @@ impl Builder<'_> {
 
     fn integer_layer(
         &self,
-        source: ValueId,
+        node: &Node,
         layer: &Layer<'_>,
         input: QTensorId,
         output: QTensorId,
     ) -> Result<IntegerLayer> {
+        let source = node.inputs[0];
         let (input_scale, output_scale) = (self.scale(input), self.scale(output));
         let zero_point = f64::from(self.zero_point(input));
         let magnitude = self.magnitude(input);
         let raw_magnitude = if self.model.tensor(input).element == ElementType::I8 { 383.0 } else { 32768.0 };
         let means = &self.statistics.of(source).channel_mean;
         let quantized_means = &self.quantized_means[source.0 as usize];
+        let roundings: Vec<Rounding> = match self.covariances.of(node.output) {
+            Some(covariances) => covariances.iter().map(Rounding::by).collect(),
+            None => vec![Rounding::nearest(); layer.groups],
+        };
         let mut integer = IntegerLayer {
             weights: Vec::with_capacity(layer.weights.len()),
             weight_scales: Vec::with_capacity(layer.outputs),
@@ -147,7 +153,7 @@ impl Builder<'_> {
             let scale = (largest / 127.0)
                 .max(bias.abs() / (input_scale * f64::exp2(27.0)))
                 .max(f64::exp2(-26.0) * output_scale / input_scale);
-            let codes: Vec<f64> = row.iter().map(|w| round(w / scale).clamp(-127.0, 127.0)).collect();
+            let codes = roundings[o / (layer.outputs / layer.groups)].round(&row, scale);
             let mean_of = |k: usize| layer.normalization.map_or(0.0, |n| f64::from(n.mean[layer.channel(o, k)]));
             if self.options.bias_correction {
                 // What the layer gives on average with quantized weights and inputs, less what it should give.

@@ -489,8 +489,8 @@ fn scratch_bytes(step: &Step, records: &[TensorRecord]) -> u32 {
             plan::conv2d_scratch_bytes(s.kernel, input, output, s.window, s.groups)
         }
         Step::Linear(s) => {
-            let (input, output) = (record(s.input), record(s.output).shape);
-            plan::linear_scratch_bytes(s.kernel, input.shape.channels, output.channels, input.element)
+            let input = record(s.input);
+            plan::linear_scratch_bytes(s.kernel, input.shape.positions(), input.shape.channels, input.element)
         }
         Step::Attention(s) => {
             let shape = record(s.output).shape;
