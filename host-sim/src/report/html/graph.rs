@@ -48,10 +48,10 @@ fn lowest(steps: &[StepReport], figure: impl Fn(&StepReport) -> Option<f64>) -> 
 
 fn worst(steps: &[StepReport], figure: impl Fn(&StepReport) -> Option<f64>) -> Markup {
     let row = |(number, (step, db)): (usize, (&StepReport, f64))| {
-        vec![(number + 1).to_string(), step.step.clone(), step.op.clone().into_owned(), decibels(Some(db))]
+        vec![format!("{}. {}", number + 1, step.step), step.op.clone().into_owned(), decibels(Some(db))]
     };
     let rows: Vec<_> = lowest(steps, figure).into_iter().enumerate().map(row).collect();
-    table(&["", "step", "operator", "SQNR"], 3, &rows)
+    table(&["step", "operator", "SQNR"], 2, &rows)
 }
 
 fn plot(steps: &[StepReport]) -> Markup {

@@ -1,7 +1,7 @@
 //! The arena over time: where every buffer lies, from which step to which.
 
 use super::plot::{Axis, LEFT, RIGHT, WIDTH, px};
-use super::text::{bytes, short_bytes};
+use super::text::{bytes, short_bytes, short_name};
 use super::{data, table};
 use crate::report::Summary;
 use crate::report::memory::{Buffer, MemoryReport};
@@ -61,8 +61,9 @@ fn rectangle(buffer: &Buffer, peak: u32, x: &Axis, y: &Axis) -> Markup {
     let (left, right) = (x.at(f64::from(buffer.first_step) - 0.5), x.at(f64::from(buffer.last_step) + 0.5));
     let (low, high) = (y.at(buffer.offset as f64), y.at((buffer.offset + buffer.bytes) as f64));
     let at_peak = (buffer.first_step..=buffer.last_step).contains(&peak);
-    let short = buffer.name.rsplit('.').next().unwrap_or(&buffer.name);
-    let is_room = right - left > short.len() as f64 * CHARACTER + 8.0 && low - high > 13.0;
+    let short = short_name(&buffer.name);
+    let indent = if buffer.in_place_of.is_some() { 10.0 } else { 5.0 };
+    let is_room = right - left > short.len() as f64 * CHARACTER + indent && low - high > 13.0;
     html! {
         g.buffer.scratch[buffer.scratch].at-peak[at_peak] {
             title { (hover(buffer)) }
@@ -72,7 +73,7 @@ fn rectangle(buffer: &Buffer, peak: u32, x: &Axis, y: &Axis) -> Markup {
                 path.notch d={ "M" (px(left)) "," (px(middle - size)) "l" (px(size)) "," (px(size)) "l" (px(-size)) ","
                     (px(size)) "z" } {}
             }
-            @if is_room { text x=(px(left + 5.0)) y=(px((low + high) / 2.0 + 4.0)) { (short) } }
+            @if is_room { text x=(px(left + indent)) y=(px((low + high) / 2.0 + 4.0)) { (short) } }
         }
     }
 }

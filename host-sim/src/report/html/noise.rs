@@ -21,7 +21,8 @@ pub(super) fn section(noise: &NoiseShares) -> Markup {
         } @else {
             "Measured: all " (measured) " steps with an error of their own."
         }
-        " All together make " (decibels(noise.measured_sqnr_db)) " there."
+        " With all steps in integers the SQNR there is " (decibels(noise.measured_sqnr_db)) "; the powers of the measured "
+        "shares add up to " (decibels(sum_db(&noise.shares))) "."
     };
     let widest = noise.shares.first().map_or(1.0, |share| share.share).max(f64::MIN_POSITIVE);
     let content = html! {
@@ -39,6 +40,12 @@ pub(super) fn section(noise: &NoiseShares) -> Markup {
         (data("Every share as a table", &shares(&noise.shares)))
     };
     super::section("noise", "Where the noise comes from", &about, &content)
+}
+
+/// SQNR of errors that add up in power.
+fn sum_db(shares: &[NoiseShare]) -> Option<f64> {
+    let noise: f64 = shares.iter().filter_map(|share| share.alone_sqnr_db).map(|db| 10_f64.powf(-db / 10.0)).sum();
+    Some(-10.0 * noise.log10())
 }
 
 fn percent(share: f64) -> String {

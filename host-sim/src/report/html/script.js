@@ -23,7 +23,7 @@ for (const table of document.querySelectorAll("table")) {
   });
 }
 // Tensors: one at a time instead of a list.
-const list = document.getElementById("tensors");
+const list = document.getElementById("tensor-list");
 if (list) {
   const cards = [...list.querySelectorAll("details.tensor")];
   const select = document.createElement("select");

@@ -17,7 +17,7 @@ pub(super) fn section(steps: &[StepReport]) -> Markup {
         "channel, narrowest first: a channel much narrower than the widest uses few of the codes."
     };
     let content = html! {
-        div #tensors {
+        div #tensor-list {
             @for (step, counts) in shown() {
                 details.tensor {
                     summary { span.number { (step.position) } " " (step.step) " " span.note { (step.op) " " (step.element) } }

@@ -59,6 +59,20 @@ pub(super) fn value(value: f64) -> String {
     text.replace('-', "−")
 }
 
+/// The end of a dotted name that still says something: `blocks.0` of `encoder.blocks.0`.
+pub(super) fn short_name(name: &str) -> &str {
+    let is_number = |part: &str| part.bytes().all(|byte| byte.is_ascii_digit());
+    let mut start = name.len();
+    for part in name.rsplit('.') {
+        start -= part.len();
+        if !is_number(part) {
+            break;
+        }
+        start = start.saturating_sub(1);
+    }
+    &name[start..]
+}
+
 /// `64×64×16`.
 pub(super) fn shape([height, width, channels]: [u16; 3]) -> String {
     format!("{height}×{width}×{channels}")
@@ -75,6 +89,7 @@ mod tests {
         assert_eq!((signed(Some(-1.26), 1), signed(Some(f64::NEG_INFINITY), 1)), ("−1.3".into(), "was exact".into()));
         assert_eq!((bytes(1_572_876), bytes(12)), ("1\u{202f}572\u{202f}876\u{202f}B".into(), "12\u{202f}B".into()));
         assert_eq!((short_bytes(1_572_864.0), short_bytes(65_536.0)), ("1.5 MiB".into(), "64 KiB".into()));
+        assert_eq!((short_name("a.layer1.0"), short_name("a.relu"), short_name("7")), ("layer1.0", "relu", "7"));
         assert_eq!((value(0.0), value(-0.5), value(12345.0)), ("0".into(), "−0.5000".into(), "12345".into()));
     }
 }

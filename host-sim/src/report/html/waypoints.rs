@@ -1,6 +1,6 @@
 //! Where both networks would drive: over the LiDAR histogram, with the camera beside it, worst frame first.
 
-use super::plot::px;
+use super::plot::{line, px};
 use super::text::figure;
 use super::{data, table};
 use crate::report::FrameReport;
@@ -19,6 +19,10 @@ const SENSOR_AHEAD_M: f64 = 1.3;
 const LEFT_M: f64 = 33.0;
 const RIGHT_M: f64 = 32.0;
 const AHEAD_M: f64 = 32.0;
+/// Units of the drawing per meter of the histogram.
+const ABOVE_SCALE: f64 = 10.0;
+/// Side of the drawing of the waypoints alone.
+const DETAIL: f64 = 340.0;
 
 pub(super) fn section(reports: &[FrameReport], frames: &[Frame]) -> Markup {
     let mut drawn: Vec<(&FrameReport, &Frame, &Waypoints)> =
@@ -61,77 +65,77 @@ fn errors(report: &FrameReport) -> String {
     }
 }
 
-/// `[right, forward]` in the plane of the drawing: forward is up.
-fn place([right, forward]: [f64; 2]) -> (f64, f64) {
-    (right, -forward)
+/// A window into the plane of the road, forward up, in units of the drawing.
+#[derive(Clone, Copy)]
+struct View {
+    /// Right and forward of the upper left corner, m.
+    corner: [f64; 2],
+    /// Units per meter.
+    scale: f64,
+}
+
+impl View {
+    fn at(&self, [right, forward]: [f64; 2]) -> (f64, f64) {
+        (self.scale * (right - self.corner[0]), self.scale * (self.corner[1] - forward))
+    }
+
+    fn track(&self, waypoints: &Waypoints) -> String {
+        line([&[0.0, 0.0]].into_iter().chain(waypoints).map(|&waypoint| Some(self.at(waypoint))))
+    }
 }
 
 fn from_above(report: &FrameReport, frame: &Frame, waypoints: &Waypoints, map: &ByteMap) -> Markup {
-    let sensor = -SENSOR_AHEAD_M;
-    let view = format!("{} {} {} {}", -LEFT_M, sensor - AHEAD_M, LEFT_M + RIGHT_M, AHEAD_M + 4.0);
+    let view = View { corner: [-LEFT_M, SENSOR_AHEAD_M + AHEAD_M], scale: ABOVE_SCALE };
+    let (width, height) = (ABOVE_SCALE * (LEFT_M + RIGHT_M), ABOVE_SCALE * AHEAD_M);
+    let (x, y) = view.at([0.0, 0.0]);
     html! {
-        svg.above viewBox=(view) role="img" aria-label={ "Waypoints of frame " (report.name) " over its LiDAR histogram" } {
-            image.lidar href=(lidar_uri(map)) x=(-LEFT_M) y=(px(sensor - AHEAD_M)) width=(LEFT_M + RIGHT_M)
-                height=(AHEAD_M) preserveAspectRatio="none" {}
-            path.ego d="M-0.9,2V-2L0,-2.6L0.9,-2V2z" { title { "ego vehicle" } }
+        svg.above viewBox={ "0 0 " (px(width)) " " (px(height + 4.0 * ABOVE_SCALE)) } role="img"
+            aria-label={ "Waypoints of frame " (report.name) " over its LiDAR histogram" } {
+            image.lidar href=(lidar_uri(map)) width=(px(width)) height=(px(height)) preserveAspectRatio="none" {}
+            path.ego d={ "M" (px(x - 9.0)) "," (px(y + 22.0)) "v-42l9,-6l9,6v42z" } { title { "ego vehicle" } }
             @if let Some([right, y]) = frame.goal {
-                path.goal d={ "M" (px(right - 1.0)) "," (px(y)) "h2m-1,-1v2" } { title { "goal" } }
+                @let (x, y) = view.at([right, -y]);
+                path.goal d={ "M" (px(x - 9.0)) "," (px(y)) "h18m-9,-9v18" } { title { "goal" } }
             }
-            (tracks(report, waypoints, 1.0))
+            (tracks(report, waypoints, view))
         }
     }
 }
 
 /// The waypoints alone, as large as they fit.
 fn detail(report: &FrameReport, waypoints: &Waypoints) -> Markup {
-    let points = waypoints.iter().chain(report.reference_waypoints.iter().flatten()).map(|&w| place(w));
-    let start = ((0.0_f64, 0.0_f64), (0.0_f64, 0.0_f64));
-    let ((left, top), (right, bottom)) =
-        points.fold(start, |(low, high), (x, y)| ((low.0.min(x), low.1.min(y)), (high.0.max(x), high.1.max(y))));
-    let side = (right - left).max(bottom - top).max(1.0) * 1.3;
-    let corner = ((left + right - side) / 2.0, (top + bottom - side) / 2.0);
-    let view = format!("{:.2} {:.2} {side:.2} {side:.2}", corner.0, corner.1);
-    // One meter, or a power of ten that is a good part of the picture.
-    let bar = 10_f64.powf((side / 2.5).log10().floor());
+    let points = waypoints.iter().chain(report.reference_waypoints.iter().flatten());
+    let (low, high) = points.fold(([0.0_f64; 2], [0.0_f64; 2]), |(low, high), &[right, forward]| {
+        ([low[0].min(right), low[1].min(forward)], [high[0].max(right), high[1].max(forward)])
+    });
+    let side = (high[0] - low[0]).max(high[1] - low[1]).max(1.0) * 1.25;
+    let corner = [(low[0] + high[0] - side) / 2.0, (low[1] + high[1] + side) / 2.0];
+    let view = View { corner, scale: DETAIL / side };
+    let (x, y) = view.at([0.0, 0.0]);
+    // The greatest power of ten that is at most four tenths of the side.
+    let bar = 10_f64.powf((0.4 * side).log10().floor());
     html! {
-        svg.detail viewBox=(view) role="img" aria-label={ "Waypoints of frame " (report.name) } {
-            path.grid d={ "M0," (px2(corner.1)) "v" (px2(side)) "M" (px2(corner.0)) ",0h" (px2(side)) }
-                stroke-width=(px2(side / 300.0)) {}
-            path.bound d={ "M" (px2(corner.0 + side * 0.05)) "," (px2(corner.1 + side * 0.96)) "h" (bar) }
-                stroke-width=(px2(side / 120.0)) {}
-            text x=(px2(corner.0 + side * 0.05)) y=(px2(corner.1 + side * 0.93)) font-size=(px2(side / 16.0)) {
-                (bar) " m" }
-            (tracks(report, waypoints, side / 40.0))
+        svg.detail viewBox={ "0 0 " (DETAIL) " " (DETAIL) } role="img" aria-label={ "Waypoints of frame " (report.name) } {
+            path.grid d={ "M" (px(x)) ",0V" (DETAIL) "M0," (px(y)) "H" (DETAIL) } {}
+            path.scale d={ "M12," (px(DETAIL - 12.0)) "h" (px(bar * view.scale)) } {}
+            text x="12" y=(px(DETAIL - 20.0)) { (bar) " m" }
+            (tracks(report, waypoints, view))
         }
     }
 }
 
-/// Both tracks from the origin; marks are `size` meters wide.
-fn tracks(report: &FrameReport, waypoints: &Waypoints, size: f64) -> Markup {
-    let half = size / 2.0;
+/// Both tracks from the origin.
+fn tracks(report: &FrameReport, waypoints: &Waypoints, view: View) -> Markup {
     html! {
         @if let Some(reference) = &report.reference_waypoints {
-            path.reference d=(track(reference)) stroke-width=(px2(size / 5.0))
-                stroke-dasharray={ (px2(size)) " " (px2(size / 2.0)) } {}
-            @for (x, y) in reference.iter().map(|&w| place(w)) {
-                circle.reference cx=(px2(x)) cy=(px2(y)) r=(px2(half * 1.3)) stroke-width=(px2(size / 5.0)) {}
-            }
+            path.reference d=(view.track(reference)) {}
+            @for (x, y) in reference.iter().map(|&w| view.at(w)) { circle.reference cx=(px(x)) cy=(px(y)) r="6" {} }
         }
-        path.engine d=(track(waypoints)) stroke-width=(px2(size / 5.0)) {}
-        @for (x, y) in waypoints.iter().map(|&w| place(w)) {
-            rect.engine x=(px2(x - half / 2.0)) y=(px2(y - half / 2.0)) width=(px2(half)) height=(px2(half)) {}
+        path.engine d=(view.track(waypoints)) {}
+        @for (x, y) in waypoints.iter().map(|&w| view.at(w)) {
+            rect.engine x=(px(x - 3.0)) y=(px(y - 3.0)) width="6" height="6" {}
         }
     }
-}
-
-fn track(waypoints: &Waypoints) -> String {
-    let to = |(x, y): (f64, f64)| format!("L{},{}", px2(x), px2(y));
-    waypoints.iter().map(|&w| to(place(w))).fold("M0,0".to_owned(), |path, point| path + &point)
-}
-
-/// A coordinate in meters, to the centimeter.
-fn px2(meters: f64) -> String {
-    format!("{meters:.2}")
 }
 
 /// The histogram from above: rows become columns, right is right, far is up; denser cells are darker.
