@@ -169,6 +169,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
     let mut streams = 0;
     for node in &graph.nodes {
         let of = |k: usize| node.inputs.get(k).map(|id: &ValueId| roles[id.0 as usize]);
+        let wide = |k: usize| matches!(of(k), Some(Role::Vector | Role::Probabilities));
         let shape = |k: usize| graph.value(node.inputs[k]).shape;
         let role = match &node.op {
             Op::Input(kind) => Role::Input(*kind),
@@ -191,7 +192,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
             Op::ResizeBilinear { .. } if node.inputs.len() == 2 => Role::Skip,
             Op::GlobalPool => Role::Vector,
             Op::AveragePool(_) if graph.value(node.output).shape.positions() == 1 => Role::Vector,
-            Op::Concat(_) if (0..node.inputs.len()).any(|k| of(k) == Some(Role::Vector)) => Role::Vector,
+            Op::Concat(_) if (0..node.inputs.len()).any(|k| wide(k)) => Role::Vector,
             Op::Slice(_) | Op::Pad(_) | Op::Clip(_) if of(0) == Some(Role::Vector) => Role::Vector,
             Op::Softmax => Role::Probabilities,
             Op::WaypointDecoder(_) => Role::Waypoints,
