@@ -246,7 +246,7 @@ struct Common {
     /// Machine-readable result on stdout, errors too.
     #[arg(long)]
     json: bool,
-    /// Runs the engine with a named fault, to show that the comparison can fail.
+    /// Runs the engine with a named fault, to show that the comparison can fail (kernels: `--backend portable` only).
     #[cfg(feature = "fault-injection")]
     #[arg(long, value_name = "NAME")]
     fault: Option<String>,

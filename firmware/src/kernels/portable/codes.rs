@@ -5,7 +5,7 @@ use crate::tensor::Codes;
 use bytemuck::{AnyBitPattern, NoUninit};
 
 /// An element type of activations.
-pub(in crate::kernels) trait Code: Copy + Ord + Into<i32> {
+pub(in crate::kernels) trait Code: Copy + Ord {
     /// The smallest code.
     const LOWEST: Self;
     /// Code 0.

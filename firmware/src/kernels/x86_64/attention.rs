@@ -13,7 +13,7 @@ use crate::tensor::{CodesMut, index};
 /// Most tokens, and widest head, of an image.
 const MAX_LEN: usize = 512;
 
-/// [`portable::attention::attention`] with AVX2. Uses none of `scratch` (where it does not fall back) but 88 KiB of the
+/// [`portable::attention::attention`] with AVX2. Uses none of `scratch` (where it does not fall back) but 84 KiB of the
 /// stack, like [`avx512`].
 #[target_feature(enable = "avx2")]
 pub(super) fn avx2(
