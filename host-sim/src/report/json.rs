@@ -8,6 +8,7 @@ use crate::gates::GateOutcome;
 use crate::run::RunReport;
 use model_compiler::error::{Error, ErrorCode, Result};
 use schemars::JsonSchema;
+use schemars::generate::SchemaSettings;
 use serde::{Serialize, Serializer};
 use serde_json::{Value, json};
 use std::path::Path;
@@ -38,12 +39,13 @@ pub fn diff(diff: &Diff, gates: &[GateOutcome], failure: Option<&Error>) -> Valu
 
 /// JSON Schema of a verification's document.
 pub fn schema() -> Value {
-    schemars::schema_for!(VerifyReport).to_value()
+    let generator = SchemaSettings::default().for_serialize().into_generator();
+    generator.into_root_schema_for::<VerifyReport>().to_value()
 }
 
-/// A document as the bytes of a file, indented.
+/// A document as the bytes of a file.
 pub fn bytes(document: &Value) -> Vec<u8> {
-    format!("{document:#}\n").into_bytes()
+    format!("{document}\n").into_bytes()
 }
 
 /// Reads the report of an earlier verification.

@@ -7,12 +7,12 @@ use crate::channels::Channels;
 use crate::report::StepReport;
 use maud::{Markup, html};
 
-const WIDTH: f64 = 520.0;
-const HEIGHT: f64 = 130.0;
+const WIDTH: f64 = 640.0;
+const HEIGHT: f64 = 150.0;
 const TOP: f64 = 6.0;
 const BOTTOM: f64 = HEIGHT - 18.0;
 /// Channels that a plot shows; of more, evenly spaced ones.
-const SHOWN: usize = 96;
+const SHOWN: usize = 80;
 /// Steps in the table.
 const WIDEST: usize = 20;
 
@@ -73,8 +73,8 @@ pub(super) fn plot(step: &StepReport, channels: &Channels) -> Markup {
     let y = super::plot::Axis::new([low.into(), high.into()], [BOTTOM, TOP]);
     let pitch = WIDTH / count.max(1) as f64;
     let bar = |(index, &channel): (usize, &usize)| {
-        let (min, max) = (y.at(channels.min[channel].into()), y.at(channels.max[channel].into()));
-        format!("M{},{}V{}", px((index as f64 + 0.5) * pitch), px(min), px(max.min(min - 1.0)))
+        let [min, max] = [channels.min[channel], channels.max[channel]].map(|value| y.at(value.into()).round());
+        format!("M{},{}V{}", px(((index as f64 + 0.5) * pitch).round()), px(min), px(max.min(min - 1.0)))
     };
     let bars: String = picked.iter().enumerate().map(bar).collect();
     let all = channels.min.len();

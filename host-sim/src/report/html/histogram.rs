@@ -6,8 +6,9 @@ use crate::histogram::Histogram;
 use crate::report::StepReport;
 use maud::{Markup, html};
 
-const WIDTH: f64 = 520.0;
-const HEIGHT: f64 = 150.0;
+/// Ten units per bin: with whole coordinates, paths are short.
+const WIDTH: f64 = 640.0;
+const HEIGHT: f64 = 180.0;
 const TOP: f64 = 14.0;
 const BOTTOM: f64 = HEIGHT - 20.0;
 
@@ -19,7 +20,7 @@ pub(super) fn plot(step: &StepReport, histogram: &Histogram) -> Markup {
     let height = |count: u64| match count {
         0 => BOTTOM,
         // A single value stays visible.
-        count => BOTTOM - (BOTTOM - TOP) * (0.03 + 0.97 * (count as f64).log10() / decades),
+        count => (BOTTOM - (BOTTOM - TOP) * (0.03 + 0.97 * (count as f64).log10() / decades)).round(),
     };
     let end = histogram.first + histogram.width * bins as f64;
     let x = |value: f64| WIDTH * (value - histogram.first) / (end - histogram.first);
@@ -71,6 +72,6 @@ mod tests {
     #[test]
     fn equal_bins_share_a_line() {
         let path = outline(&[0, 7, 7, 0], |count| BOTTOM - count as f64, false);
-        assert_eq!(path, "M0,130V130H130V123H390V130H520");
+        assert_eq!(path, "M0,160V160H160V153H480V160H640");
     }
 }
