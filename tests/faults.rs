@@ -27,7 +27,7 @@ fn expected_operators(fault: Fault) -> &'static [&'static str] {
         Fault::GateOrder | Fault::ResetBeforeBias | Fault::TanhNextEntry | Fault::GoalFirstStepOnly => {
             &["waypoint_decoder"]
         }
-        Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention"],
+        Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention", "softmax"],
         Fault::LayerNormEpsilon => &["layer_norm"],
         Fault::DepthTail | Fault::MultiplierPlusOne | Fault::ChannelsSwapped => WEIGHTED,
         // Where the bytes in front of the scratch belong to an operand of the same step, the engine refuses to cut
@@ -37,6 +37,8 @@ fn expected_operators(fault: Fault) -> &'static [&'static str] {
         Fault::TokenOrder => &["tokens"],
         Fault::MaxPoolPadding => &["max_pool"],
         Fault::PoolSecondMap => &["global_pool"],
+        Fault::BoxOffset | Fault::BorderZero => &["copy_box"],
+        Fault::ConcatOrder => &["concat"],
     }
 }
 

@@ -11,6 +11,7 @@
 //! fuse it ([`crate::passes`]). Both forms run on the reference interpreter. A fused node keeps the name of the last
 //! node of its chain, so a value is found under the same name before and after.
 
+pub use firmware::program::Axis;
 use firmware::program::Window;
 pub use firmware::tensor::Shape;
 use std::sync::Arc;
@@ -176,17 +177,6 @@ pub struct Pad {
     pub after: [u16; 3],
     /// Value of the border.
     pub value: f32,
-}
-
-/// An axis of a map.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
-pub enum Axis {
-    /// Rows.
-    Height,
-    /// Columns.
-    Width,
-    /// Channels.
-    Channels,
 }
 
 /// GRU cell and output layer, run `steps` times (spec 1.0). Inputs: hidden state, goal. Output `steps × 1 × 2`.

@@ -6,20 +6,24 @@
 
 use crate::calibrate::{self, Statistics};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Clip, Graph, Node, Op, ValueId};
+use crate::ir::{Conv2d, Graph, Node, Op, Shape, ValueId};
 use crate::qmodel::{Bounds, Port, QModel, QOp, QStep, QTensor, QTensorId};
 use covariance::Covariances;
-use firmware::program::Clamp;
+use firmware::program::{Clamp, Window};
 use firmware::tensor::ElementType;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::fmt;
 
+mod bounds;
+mod copies;
 mod covariance;
 mod decoder;
 pub mod factors;
+mod moves;
 pub mod ranges;
 mod rounding;
+mod softmax;
 mod sums;
 pub mod tables;
 mod token;
@@ -212,13 +216,12 @@ impl Builder<'_> {
             Op::LayerNorm(norm) => self.layer_norm(node, norm),
             Op::Attention { heads } => self.attention(node, *heads),
             Op::WaypointDecoder(decoder) => self.waypoint_decoder(node, decoder),
-            Op::Normalize(_)
-            | Op::BatchNorm(_)
-            | Op::Clip(_)
-            | Op::Slice(_)
-            | Op::Pad(_)
-            | Op::Concat(_)
-            | Op::Softmax => Err(Error::new(
+            Op::Slice(slice) => self.slice(node, slice),
+            Op::Pad(pad) => self.pad(node, pad),
+            Op::Concat(axis) => self.concat(node, *axis),
+            Op::Clip(clip) => self.clip(node, *clip),
+            Op::Softmax => self.softmax(node),
+            Op::Normalize(_) | Op::BatchNorm(_) => Err(Error::new(
                 ErrorCode::Unsupported,
                 "",
                 format!("{} stands alone and has no integer form", node.op.name()),
@@ -238,10 +241,44 @@ impl Builder<'_> {
         id
     }
 
+    /// The tensor of a value that must be stored as codes.
+    fn codes(&mut self, value: ValueId) -> Result<QTensorId> {
+        let id = self.tensor(value);
+        if matches!(self.model.tensor(id).element, ElementType::I8 | ElementType::I16) {
+            return Ok(id);
+        }
+        let place = format!("operand {}", self.graph.value(value).name);
+        Err(Error::new(ErrorCode::Unsupported, place, "found 32-bit fixed point, expected 8- or 16-bit codes"))
+    }
+
+    /// The step that computes the operand of `node`, where nothing else reads that operand and it is stored like the
+    /// result: it becomes the step of `node`, and the caller adds what the node does. None where `suits` declines it.
+    fn take_over(&mut self, node: &Node, suits: impl Fn(&QOp) -> bool) -> Option<usize> {
+        let (operand, result) = (node.inputs[0], node.output);
+        let alike = self.types.of(operand).holds_like(self.types.of(result));
+        if !alike || copies::use_counts(self.graph)[operand.0 as usize] != 1 {
+            return None;
+        }
+        let id = *self.stored.get(&operand)?;
+        let index = self.model.steps.iter().rposition(|step| step.op.output() == id && suits(&step.op))?;
+        let taken = self.qtensor(node.name.clone(), result, *self.types.of(result));
+        self.model.tensors[id.0 as usize] = taken;
+        self.stored.insert(result, id);
+        self.model.steps[index].name.clone_from(&node.name);
+        self.model.steps[index].node = Some(node.name.clone());
+        Some(index)
+    }
+
     fn add_tensor(&mut self, name: String, value: ValueId, stored: types::Stored) -> QTensorId {
         let id = QTensorId(self.model.tensors.len() as u32);
+        let tensor = self.qtensor(name, value, stored);
+        self.model.tensors.push(tensor);
+        id
+    }
+
+    fn qtensor(&self, name: String, value: ValueId, stored: types::Stored) -> QTensor {
         let source = self.graph.value(value);
-        self.model.tensors.push(QTensor {
+        QTensor {
             name,
             value: source.name.clone(),
             shape: source.shape,
@@ -249,8 +286,7 @@ impl Builder<'_> {
             scale: stored.scale,
             zero_point: stored.zero_point,
             saturation_ppm: stored.saturation_ppm,
-        });
-        id
+        }
     }
 
     /// A value as i8: itself, or a copy made by an extra step where it is stored in 16 bits.
@@ -292,23 +328,19 @@ impl Builder<'_> {
         self.model.tensor(id).zero_point as i16
     }
 
-    /// Bounds of an output code: those of its type, and the codes nearest to the clip (ReLU: the zero point).
-    fn clamp(&self, id: QTensorId, clip: Clip) -> Clamp {
-        let tensor = self.model.tensor(id);
-        let (min, max) = code_range(tensor.element);
-        let code = |bound: f32| {
-            let code = factors::round(f64::from(bound) / tensor.scale) + f64::from(tensor.zero_point);
-            code.clamp(f64::from(min), f64::from(max)) as i16
-        };
-        Clamp { min: code(clip.min), max: code(clip.max) }
-    }
-
     /// Largest `|q − z|` of a tensor.
     fn magnitude(&self, id: QTensorId) -> f64 {
         let (min, max) = code_range(self.model.tensor(id).element);
         let z = f64::from(self.zero_point(id));
         (f64::from(max) - z).max(z - f64::from(min))
     }
+}
+
+/// Whether a convolution is the matrix product of one position, which takes 16-bit codes as they are.
+fn is_linear(conv: &Conv2d, input: Shape) -> bool {
+    let Window { kernel_h, kernel_w, pad_top, pad_bottom, pad_left, pad_right, .. } = conv.window;
+    let alone = [kernel_h, kernel_w, pad_top, pad_bottom, pad_left, pad_right] == [1, 1, 0, 0, 0, 0];
+    alone && input.positions() == 1 && conv.groups == 1 && conv.normalization.is_none()
 }
 
 /// Smallest and largest code of an element type that activations use.
@@ -322,6 +354,7 @@ fn bounds_of(accumulator_bits: u32, products: &[f64], multiplier_rounding: f64) 
     let accumulator_spare = if accumulator_bits > 31 { 63 - accumulator_bits } else { 31 - accumulator_bits };
     Bounds {
         accumulator_bits: accumulator_bits as u8,
+        clipped: [false; 2],
         headroom_bits: accumulator_spare.min(53u32.saturating_sub(product_bits)) as u8,
         multiplier_rounding,
     }

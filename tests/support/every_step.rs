@@ -9,7 +9,8 @@ use firmware::tensor::Shape;
 use model_compiler::emit::{AlignedBytes, ImageParts, KnownAnswer};
 use model_compiler::frames::{ByteMap, Frame};
 use model_compiler::ir::{
-    Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Tokens, ValueId, WaypointDecoder, Weights,
+    Axis, Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Pad, Slice, Tokens, ValueId,
+    WaypointDecoder, Weights,
 };
 use model_compiler::pack::pack;
 use model_compiler::pipeline::{self, Compiled};
@@ -25,7 +26,7 @@ const CHANNELS: usize = 4;
 const SIZE: u16 = 16;
 
 /// Names of all operators, as [`firmware::program::Step::name`] gives them.
-pub const OPERATORS: [&str; 12] = [
+pub const OPERATORS: [&str; 15] = [
     "conv2d",
     "linear",
     "max_pool",
@@ -38,6 +39,9 @@ pub const OPERATORS: [&str; 12] = [
     "layer_norm",
     "attention",
     "waypoint_decoder",
+    "copy_box",
+    "concat",
+    "softmax",
 ];
 
 /// The float network.
@@ -63,7 +67,8 @@ pub fn graph() -> Graph {
     let hidden = b.linear("join.2", &[joined], CHANNELS, Clip::NONE);
     let decoder = b.decoder();
     let waypoints = b.push("waypoints", decoder, &[hidden, goal]);
-    b.graph.outputs.push(waypoints);
+    let probabilities = b.classifier(image, lidar, bev);
+    b.graph.outputs.extend([waypoints, probabilities]);
     b.graph
 }
 
@@ -206,6 +211,27 @@ impl Builder {
         [("ln_f.image", 0), ("ln_f.lidar", 4)].map(|(name, first_row)| self.layer_norm(name, x, first_row, (2, 2)))
     }
 
+    /// Every other pixel of one map in a border of channels (the shortcut without weights), bordered pixels of the other
+    /// within bounds, both joined; probabilities per pixel of that, and of a corner of an input.
+    fn classifier(&mut self, image: ValueId, lidar: ValueId, bev: ValueId) -> ValueId {
+        let every_other = Slice { begin: [1, 0, 1], end: [4, 4, 4], stride: [2, 2, 1] };
+        let sliced = self.push("class.slice", Op::Slice(every_other), &[image]);
+        let channels = Pad { before: [0, 0, 2], after: [0; 3], value: 0.0 };
+        let shortcut = self.push("class.shortcut", Op::Pad(channels), &[sliced]);
+        let pooled = self.push("class.pool", Op::MaxPool(Window::square(4, 1, 0)), &[lidar]);
+        let pixels = Pad { before: [1, 0, 0], after: [0, 1, 0], value: 0.25 };
+        let padded = self.push("class.pad", Op::Pad(pixels), &[pooled]);
+        let clipped = self.push("class.clip", Op::Clip(Clip { min: 0.125, max: 1.0 }), &[padded]);
+        let joined = self.push("class.join", Op::Concat(Axis::Channels), &[shortcut, clipped]);
+        let logits = self.conv("class.logits", &[joined], Window::square(1, 1, 0), 1, None, Clip::NONE);
+        let probabilities = self.push("class.softmax", Op::Softmax, &[logits]);
+        let corner = Slice { begin: [6, 6, 0], end: [8, 8, 2], stride: [1; 3] };
+        let counts = self.push("class.corner", Op::Slice(corner), &[bev]);
+        let counts = self.push("class.counts", Op::Pad(channels), &[counts]);
+        let counts = self.push("class.likely", Op::Softmax, &[counts]);
+        self.push("class.probabilities", Op::Concat(Axis::Width), &[probabilities, counts])
+    }
+
     fn decoder(&mut self) -> Op {
         Op::WaypointDecoder(WaypointDecoder {
             input_weights: self.weights(&[3 * CHANNELS, 2]),
@@ -224,7 +250,8 @@ mod tests {
     use super::*;
     use firmware::engine::Engine;
     use firmware::kernels::Portable;
-    use firmware::program::{Residual, Step};
+    use firmware::program::{Requant, Residual, Step};
+    use firmware::tensor::{ElementType, TensorId};
     use model_compiler::emit::emit;
 
     #[test]
@@ -246,6 +273,19 @@ mod tests {
         assert!(forms(&|s| matches!(s, Step::ResizeBilinear(s) if s.residual.is_some())));
         assert!(forms(&|s| matches!(s, Step::ResizeBilinear(s) if s.residual.is_none())));
         assert!(forms(&|s| matches!(s, Step::LayerNorm(s) if s.first_row > 0)));
+        let element = |id: TensorId| parts.tensors[usize::from(id.0)].element;
+        assert!(
+            forms(&|s| matches!(s, Step::CopyBox(s) if s.stride[0] > 1 && s.before[2] > 0)),
+            "slice and pad in one"
+        );
+        assert!(forms(&|s| matches!(s, Step::CopyBox(s) if s.stride == [1; 3] && s.begin == [0; 3])), "pad alone");
+        assert!(forms(&|s| matches!(s, Step::Concat(s) if s.axis == Axis::Channels)));
+        assert!(forms(&|s| matches!(s, Step::Concat(s) if s.axis == Axis::Width)));
+        let exact = Requant { multiplier: 1 << 23, shift: 23 };
+        assert!(forms(&|s| matches!(s, Step::Concat(s) if s.second.requant == exact)), "moved");
+        assert!(forms(&|s| matches!(s, Step::Concat(s) if s.first.requant != exact)), "rescaled");
+        assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I16)));
+        assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I8)));
         let in_place = parts.tensors.iter().filter(|tensor| tensor.in_place_of.is_some()).count();
         assert!(in_place >= 3, "{in_place} tensors in place");
     }

@@ -6,7 +6,9 @@
 pub mod attention;
 mod axis;
 mod codes;
+pub mod concat;
 pub mod conv2d;
+pub mod copy_box;
 pub mod elementwise;
 pub mod layer_norm;
 pub mod linear;
@@ -15,6 +17,7 @@ mod oracle;
 pub mod pool;
 mod product;
 pub mod resize_bilinear;
+pub mod softmax;
 pub mod tokens;
 pub mod waypoint_decoder;
 

@@ -78,7 +78,9 @@ impl Builder<'_> {
             zero_point: self.zero_point(output),
             clamp: self.clamp(output, clip),
         };
-        self.step(node, op, Self::sum_bounds(&terms, factors[0].bound.max(factors[1].bound)));
+        let mut bounds = Self::sum_bounds(&terms, factors[0].bound.max(factors[1].bound));
+        bounds.clipped = self.clipped(output, clip);
+        self.step(node, op, bounds);
         Ok(())
     }
 

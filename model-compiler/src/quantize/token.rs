@@ -5,6 +5,7 @@ use super::{Builder, bounds_of, tables};
 use crate::error::{Error, ErrorCode, Result};
 use crate::ir::{Clip, LayerNorm, Node, Tokens};
 use crate::qmodel::{QOp, QTensorId, QTokenSource};
+use firmware::tensor::ElementType;
 
 /// Largest row, head and channel counts for which the bounds of the numerics page hold.
 const MAX_TOKENS: u32 = 512;
@@ -124,6 +125,13 @@ impl Builder<'_> {
         let output = self.tensor(node.output);
         let shape = self.model.tensor(query).shape;
         let width = shape.channels / heads;
+        for operand in [query, key, value].map(|id| self.model.tensor(id)) {
+            if operand.element != ElementType::I8 || operand.zero_point != 0 {
+                let message = "found affine or 16-bit codes, expected symmetric 8-bit ones";
+                return Err(Error::new(ErrorCode::Unsupported, format!("operand {}", operand.name), message)
+                    .with_help("give attention the outputs of linear layers of their own"));
+            }
+        }
         if shape.positions() > MAX_TOKENS {
             return Err(too_large("attention tokens", shape.positions(), MAX_TOKENS));
         }

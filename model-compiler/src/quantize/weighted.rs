@@ -4,9 +4,10 @@ use super::factors::{self, Factor, bits, round};
 use super::rounding::Rounding;
 use super::{Builder, bounds_of};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Clip, Conv2d, Linear, Node, Normalization};
+use crate::ir::{Clip, Conv2d, Linear, Node, Normalization, Weights};
 use crate::qmodel::{Bounds, QOp, QRescale, QResidual, QTensorId};
 use firmware::tensor::ElementType;
+use std::sync::Arc;
 
 /// Bits that an accumulator may have before it is multiplied, in the plain form and as a term of a sum.
 const REQUANT_ACCUMULATOR_BITS: u32 = 28;
@@ -48,6 +49,12 @@ struct IntegerLayer {
 
 impl Builder<'_> {
     pub(super) fn conv2d(&mut self, node: &Node, conv: &Conv2d) -> Result<()> {
+        if super::is_linear(conv, self.graph.value(node.inputs[0]).shape) {
+            let weights =
+                Weights { shape: vec![conv.weights.shape[0], conv.weights.shape[3]], ..(*conv.weights).clone() };
+            let linear = Linear { weights: Arc::new(weights), bias: conv.bias.clone(), clip: conv.clip };
+            return self.linear(node, &linear);
+        }
         let input = self.narrow(node.inputs[0])?;
         let layer = Layer {
             weights: &conv.weights.data,
@@ -108,6 +115,7 @@ impl Builder<'_> {
             .with_help("split the layer into groups of input channels"));
         }
         bounds.accumulator_bits = accumulator_bits as u8;
+        bounds.clipped = self.clipped(output, layer.clip);
         let spare = if wide { 63 - accumulator_bits } else { 31 - accumulator_bits };
         bounds.headroom_bits = bounds.headroom_bits.min(spare as u8);
         Ok((integer.weights, rescale, bounds, wide))

@@ -31,13 +31,9 @@ pub(super) fn pad(pad: &Pad, shape: Shape, map: &[f32], output: Shape) -> Vec<f3
 
 /// The maps one after the other along an axis.
 pub(super) fn concat(axis: Axis, shapes: &[Shape], maps: &[&[f32]]) -> Vec<f32> {
-    // Elements that lie together: below the axis everything, above it one run per map in turn.
-    let run = |s: &Shape| match axis {
-        Axis::Height => s.elements() as usize,
-        Axis::Width => usize::from(s.width) * usize::from(s.channels),
-        Axis::Channels => usize::from(s.channels),
-    };
-    let mut runs: Vec<_> = maps.iter().zip(shapes).map(|(map, shape)| map.chunks_exact(run(shape))).collect();
+    // One run per map in turn.
+    let runs = maps.iter().zip(shapes).map(|(map, shape)| map.chunks_exact(axis.run(*shape) as usize));
+    let mut runs: Vec<_> = runs.collect();
     let mut out = Vec::with_capacity(maps.iter().map(|map| map.len()).sum());
     for _ in 0..runs[0].len() {
         runs.iter_mut().for_each(|run| out.extend_from_slice(run.next().unwrap_or_default()));
