@@ -233,7 +233,7 @@ impl QuantizeArgs {
     fn quantized(&self, path: &Path, bar: &mut Bar) -> Result<QModel> {
         let graph = self.graph(path)?;
         let calib = self.calib.as_deref().ok_or_else(|| {
-            Error::new(ErrorCode::Usage, path.display().to_string(), "a checkpoint needs calibration frames")
+            Error::new(ErrorCode::Usage, path.display().to_string(), "this model needs calibration frames")
                 .with_help("add --calib FRAMES (a frame directory or a .safetensors file of raw inputs)")
         })?;
         let format = FrameFormat { resize: self.resize.resize, ..FrameFormat::of_graph(&graph) };
