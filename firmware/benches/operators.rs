@@ -10,7 +10,7 @@ use firmware::fixed_point::EXP_TABLE_LEN;
 use firmware::image::known_answer::Generator;
 use firmware::kernels::{
     AttentionArgs, Conv2dArgs, Kernels, LayerNormArgs, LinearArgs, PoolArgs, Portable, RequantArgs, RescaleArgs,
-    ResidualArgs, ResizeArgs, SumArgs, TermArgs, TokenSourceArgs, TokensArgs, plan,
+    ResidualArgs, ResizeArgs, SumArgs, TermArgs, TokenSourceArgs, TokensArgs, k4n16, plan,
 };
 use firmware::program::{Clamp, KernelId, Requant, Window};
 use firmware::tensor::{Codes, CodesMut, ElementType, Shape, index};
@@ -78,8 +78,17 @@ struct Packed {
 }
 
 /// Packs canonical weights, `depth` per output, with the kernel that the compiler chooses for a backend.
-fn pack(_backend: &Backend, weights: &[i8], _outputs: u16, _depth: usize) -> Packed {
-    Packed { kernel: KernelId::Direct, weights: weights.to_vec() }
+fn pack(backend: &Backend, weights: &[i8], outputs: u16, depth: usize) -> Packed {
+    if backend.name == "portable" {
+        return Packed { kernel: KernelId::Direct, weights: weights.to_vec() };
+    }
+    let mut packed = vec![0; index_of(k4n16::packed_bytes(1, outputs, depth as u64))];
+    k4n16::pack(weights, outputs, depth, &mut packed);
+    Packed { kernel: KernelId::K4N16, weights: packed }
+}
+
+fn index_of(bytes: u64) -> usize {
+    usize::try_from(bytes).expect("it fits this machine")
 }
 
 /// What is measured: the operator, its shape in words, its work and the elements that it writes.
@@ -156,7 +165,7 @@ fn linear(criterion: &mut Criterion, rows: u16, inputs: u16, outputs: u16) {
     let case = Case { operator: "linear", shape: &words, work, outputs: elements(output_shape) };
     let prepare = |backend: &Backend| {
         let packed = pack(backend, &weights, outputs, inputs.into());
-        let bytes = plan::linear_scratch_bytes(packed.kernel, inputs, outputs, ElementType::I8);
+        let bytes = plan::linear_scratch_bytes(packed.kernel, rows.into(), inputs, ElementType::I8);
         (packed, scratch(bytes))
     };
     case.measure(criterion, prepare, |kernels, (packed, scratch), output| {

@@ -238,7 +238,7 @@ impl QuantizeArgs {
         bar.show("import", 0, 1);
         let graph = self.graph(path)?;
         let calib = self.calib.as_deref().ok_or_else(|| {
-            Error::new(ErrorCode::Usage, path.display().to_string(), "a checkpoint needs calibration frames")
+            Error::new(ErrorCode::Usage, path.display().to_string(), "this model needs calibration frames")
                 .with_help("add --calib FRAMES (a frame directory or a .safetensors file of raw inputs)")
         })?;
         bar.show("load frames", 0, 1);

@@ -13,6 +13,9 @@ use std::process::{Command, Stdio};
 /// Largest difference, relative to the largest output.
 const TOLERANCE: f32 = 1e-5;
 
+/// Of all generated weights and images.
+const SEED: u64 = 7;
+
 /// A network and an image for it.
 pub struct Case {
     /// What messages call it.
@@ -116,6 +119,46 @@ fn run(case: &Case) -> [Vec<f32>; 2] {
         let shapes = graph.outputs.iter().map(|&id| graph.value(id).shape);
         found.iter().zip(shapes).flat_map(|(values, shape)| channels_first(values, shape)).collect()
     })
+}
+
+/// Builds the nodes from `x` to `y`.
+pub type Build = fn(&mut OnnxFile);
+
+/// Compares a network of each operator set.
+///
+/// # Panics
+/// See [`compare`].
+#[track_caller]
+pub fn check(name: &str, dims: &[i64], opsets: &[i64], build: Build) {
+    let cases: Vec<Case> = opsets.iter().map(|&opset| case(name, dims, opset, build)).collect();
+    compare(&cases);
+}
+
+fn case(name: &str, dims: &[i64], opset: i64, build: Build) -> Case {
+    let mut file = OnnxFile::new(opset, SEED);
+    file.input("x", dims).output("y");
+    build(&mut file);
+    Case::new(format!("{name}, opset {opset}"), &file, SEED)
+}
+
+/// Compares several networks of each operator set.
+///
+/// # Panics
+/// See [`compare`].
+#[track_caller]
+pub fn check_all(name: &str, dims: &[i64], opsets: &[i64], builds: &[Build]) {
+    let cases: Vec<Case> = builds
+        .iter()
+        .enumerate()
+        .flat_map(|(i, &build)| opsets.iter().map(move |&opset| case(&format!("{name} {i}"), dims, opset, build)))
+        .collect();
+    compare(&cases);
+}
+
+/// A linear layer that shows the order of a flattened map.
+pub fn linear(f: &mut OnnxFile, input: &str, inputs: i64) {
+    let (w, b) = (f.weights("w", &[inputs, 4]), f.weights("b", &[4]));
+    f.node("Gemm", &[input, &w, &b], "y", &[]);
 }
 
 fn image_shape(graph: &Graph) -> (String, Shape) {

@@ -209,7 +209,7 @@ fn recognize(bytes: &[u8]) -> Result<Format> {
             None | Some([]) => "an empty file".to_owned(),
             Some(start) => format!("a file that begins with \"{}\"", start.escape_ascii()),
         };
-        let expected = "expected a torch zip archive (PK), a torch legacy stream (a pickle) or safetensors";
+        let expected = "expected a torch zip archive (PK), a torch legacy stream (a pickle), safetensors or ONNX";
         let help = if bytes.starts_with(b"version https://git-lfs") {
             "this is a pointer left by Git LFS: fetch the file itself with `git lfs pull`"
         } else {

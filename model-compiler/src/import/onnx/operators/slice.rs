@@ -6,12 +6,21 @@ use crate::import::onnx::node::Node;
 use crate::import::onnx::translate::Translator;
 use crate::ir::{Op, Slice};
 
-/// A range of one axis: `begin`, `end` (exclusive), `stride`.
+/// A range of one axis: from `begin` by `step` up (or down) to `end`, exclusive; `end` is −1 where it runs down to the
+/// first element.
 struct Range {
     axis: usize,
-    begin: usize,
-    end: usize,
-    stride: usize,
+    begin: i64,
+    end: i64,
+    step: i64,
+}
+
+impl Range {
+    fn indices(&self) -> Vec<usize> {
+        let at = |i: i64| self.begin.checked_add(i.checked_mul(self.step)?);
+        let inside = |&at: &i64| if self.step > 0 { at < self.end } else { at > self.end };
+        (0..).map_while(|i| at(i).filter(inside)).map(|at| at as usize).collect()
+    }
 }
 
 pub(super) fn slice(t: &mut Translator<'_>, node: &Node<'_>) -> Result<Value> {
@@ -20,8 +29,7 @@ pub(super) fn slice(t: &mut Translator<'_>, node: &Node<'_>) -> Result<Value> {
     match x {
         Value::Constant(mut tensor) => {
             for range in ranges {
-                let indices: Vec<usize> = (range.begin..range.end).step_by(range.stride).collect();
-                tensor = tensor.select(range.axis, &indices);
+                tensor = tensor.select(range.axis, &range.indices());
                 t.charge(tensor.len())?;
             }
             Ok(Value::Constant(tensor))
@@ -45,19 +53,25 @@ fn ranges(t: &mut Translator<'_>, node: &Node<'_>, dims: &[usize]) -> Result<Vec
     let mut ranges: Vec<Range> = Vec::new();
     for (i, &axis) in axes.iter().enumerate() {
         let axis = node.axis(axis, dims.len())?;
-        let size = dims[axis];
+        let size = dims[axis] as i64;
+        let step = steps[i];
+        if step == 0 {
+            return Err(node.malformed("found step 0"));
+        }
         // From the end where negative, then inside; ends beyond every size are usual.
-        let inside = |index: i64| {
-            let index = if index < 0 { index.saturating_add(size as i64) } else { index };
-            index.clamp(0, size as i64) as usize
+        let inside = |index: i64, least: i64, most: i64| {
+            let index = if index < 0 { index.saturating_add(size) } else { index };
+            index.clamp(least, most.max(least))
         };
-        let (begin, end) = (inside(starts[i]), inside(ends[i]));
-        let stride = usize::try_from(steps[i]).ok().filter(|&s| s > 0);
-        let stride = stride.ok_or_else(|| node.unsupported(format!("step {}, expected at least 1", steps[i])))?;
+        let (begin, end) = if step > 0 {
+            (inside(starts[i], 0, size), inside(ends[i], 0, size))
+        } else {
+            (inside(starts[i], -1, size - 1), inside(ends[i], -1, size - 1))
+        };
         if ranges.iter().any(|range| range.axis == axis) {
             return Err(node.malformed(format!("slices axis {axis} twice")));
         }
-        ranges.push(Range { axis, begin, end: end.max(begin), stride });
+        ranges.push(Range { axis, begin, end, step });
     }
     Ok(ranges)
 }
@@ -69,14 +83,17 @@ fn activation(t: &mut Translator<'_>, node: &Node<'_>, x: Activation, ranges: &[
     let all = Slice { begin: [0; 3], end: [x.shape.height, x.shape.width, x.shape.channels], stride: [1; 3] };
     let mut slice = all;
     for range in ranges {
-        if range.begin == range.end {
+        if range.step < 0 {
+            return Err(node.unsupported(format!("step {}, expected at least 1", range.step)));
+        }
+        if range.begin >= range.end {
             return Err(node.malformed(format!("leaves nothing of axis {} of {}", range.axis, x.described())));
         }
         if let Some(axis) = map_axes[range.axis] {
             // Within the size of the axis; a longer stride takes the same single element.
             slice.begin[axis] = range.begin as u16;
             slice.end[axis] = range.end as u16;
-            slice.stride[axis] = u16::try_from(range.stride).unwrap_or(u16::MAX);
+            slice.stride[axis] = u16::try_from(range.step).unwrap_or(u16::MAX);
         }
     }
     if slice == all {
