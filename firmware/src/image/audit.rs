@@ -8,7 +8,7 @@
 //! * Packed weights say the same to every kernel: compensations fit them, and what fills them up is zero.
 
 use super::{Image, TensorRecord};
-use crate::kernels::k4n16::{CODE_OFFSET, Packed};
+use crate::kernels::k4n16::{COMPENSATION_FACTOR, Packed};
 use crate::program::{ConstRange, Conv2d, KernelId, Linear, Rescale, Residual, Step};
 use crate::tensor::{ElementType, TensorId, index};
 use core::fmt;
@@ -255,7 +255,7 @@ impl<'a> Auditor<'_, 'a> {
                 let packed = Packed::new(weights.codes, weights.outputs, weights.depth);
                 let (codes, compensation) = packed.padded(row).zip(packed.compensation(row)).ok_or(unreadable)?;
                 codes.enumerate().try_for_each(&mut add)?;
-                if i64::from(compensation) != sum.saturating_mul(-i64::from(CODE_OFFSET)) {
+                if i64::from(compensation) != sum.saturating_mul(COMPENSATION_FACTOR.into()) {
                     let found = compensation.into();
                     return Err(AuditError::Constant {
                         step: self.position,

@@ -18,8 +18,8 @@ pub const QUAD_BYTES: usize = OUTPUTS * QUAD;
 pub const DEPTH_STEP: usize = 64;
 /// Bytes of the compensations in front of the weights of a block.
 pub const COMPENSATION_BYTES: usize = 4 * OUTPUTS;
-/// What an input code is raised by to become unsigned.
-pub const CODE_OFFSET: i32 = 128;
+/// Compensation per unit of `Σw`: input codes are raised by 128 to become unsigned.
+pub const COMPENSATION_FACTOR: i32 = -128;
 
 /// Bytes of a block of 16 outputs with `depth` weights each; saturated.
 pub const fn block_bytes(depth: u64) -> u64 {
@@ -44,7 +44,7 @@ pub fn pack(weights: &[i8], outputs: u16, depth: usize, packed: &mut [i8]) {
         let Some((compensations, quads)) = block.split_at_mut_checked(COMPENSATION_BYTES) else { return };
         for (lane, (row, compensation)) in rows.chunks(depth).zip(compensations.as_chunks_mut().0).enumerate() {
             let sum = row.iter().fold(0_i32, |sum, weight| sum.wrapping_add((*weight).into()));
-            *compensation = sum.wrapping_mul(-CODE_OFFSET).to_le_bytes().map(u8::cast_signed);
+            *compensation = sum.wrapping_mul(COMPENSATION_FACTOR).to_le_bytes().map(u8::cast_signed);
             for (weights, quad) in row.chunks(QUAD).zip(quads.chunks_exact_mut(QUAD_BYTES)) {
                 quad.iter_mut().skip(QUAD * lane).zip(weights).for_each(|(packed, weight)| *packed = *weight);
             }

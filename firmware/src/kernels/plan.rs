@@ -21,7 +21,7 @@ const PACKED_SCRATCH_BYTES: u64 = 384 << 10;
 pub const fn suits(kernel: KernelId, groups: u16, outputs: u16) -> bool {
     match kernel {
         KernelId::Direct => true,
-        KernelId::K4N16 => groups == 1 || (groups != 0 && (outputs / groups) as usize % k4n16::OUTPUTS == 0),
+        KernelId::K4N16 => groups == 1 || (groups != 0 && ((outputs / groups) as usize).is_multiple_of(k4n16::OUTPUTS)),
     }
 }
 

@@ -77,11 +77,14 @@ impl Kernels for Avx2 {
 
     fn linear(&self, args: &LinearArgs<'_>, input: Codes<'_>, output: CodesMut<'_>, scratch: &mut [u8]) {
         match (args.kernel, input) {
-            (KernelId::K4N16, Codes::I8(input)) if !args.wide => gemm::linear(*self, args, input, output, scratch),
-            (KernelId::K4N16, Codes::I16(input)) if !args.wide => gemm::linear_i16(*self, args, input, output, scratch),
-            _ => Some(portable::linear::linear(args, input, output, scratch)),
+            (KernelId::K4N16, Codes::I8(input)) if !args.wide => {
+                gemm::linear(*self, args, input, output, scratch).unwrap_or_default();
+            }
+            (KernelId::K4N16, Codes::I16(input)) if !args.wide => {
+                gemm::linear_i16(*self, args, input, output, scratch).unwrap_or_default();
+            }
+            _ => portable::linear::linear(args, input, output, scratch),
         }
-        .unwrap_or_default()
     }
 
     fn max_pool(&self, args: &PoolArgs, input: Option<Codes<'_>>, output: CodesMut<'_>) {

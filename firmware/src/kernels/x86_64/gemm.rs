@@ -42,7 +42,7 @@ pub(super) trait Tile: Copy {
     fn accumulate(self, operands: &Operands<'_, Self::Code>, sums: &mut Sums);
 
     /// [`Epilogue::finish`].
-    fn finish<T: Code>(self, epilogue: &Epilogue<'_>, sums: &[i32; CHANNELS], first: usize, output: &mut [T]);
+    fn finish<T: Code>(self, epilogue: &Epilogue<'_>, sums: &[[i32; CHANNELS]], first: usize, output: &mut [T]);
 }
 
 /// Operands of [`Tile::accumulate`].
@@ -204,16 +204,94 @@ impl Product<'_> {
         let channels = self.channels.clone().step_by(CHANNELS);
         for (first_channel, weights) in channels.zip(self.weights.chunks(BLOCKS * block_bytes)) {
             let count = CHANNELS.min(self.channels.end - first_channel);
-            let epilogue = Epilogue::new(self.rescale, first_channel, count)?;
+            let epilogue = Epilogue::new(self.rescale, first_channel..first_channel + count, self.outputs)?;
             for (first, rows) in positions.clone().step_by(ROWS).zip(rows.chunks_exact(ROWS * stride)) {
                 let operands = Operands { rows, stride, quads: self.depth.div_ceil(QUAD), weights, block_bytes };
                 let mut sums = [[0; CHANNELS]; ROWS];
                 tile.accumulate(&operands, &mut sums);
-                for (position, sums) in (first..positions.end).zip(&sums) {
-                    tile.finish(&epilogue, sums, position * self.outputs + first_channel, output);
-                }
+                tile.finish(&epilogue, sums.get(..ROWS.min(positions.end - first))?, first, output);
             }
         }
         Some(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+    use crate::kernels::x86_64::{Avx2, Avx512Vnni};
+    use crate::kernels::{Conv2dArgs, Kernels, LinearArgs, RescaleArgs, ResidualArgs};
+    use crate::program::{Clamp, KernelId, Window};
+    use crate::tensor::{Codes, CodesMut, Shape};
+    use std::boxed::Box;
+    use std::vec;
+    use std::vec::Vec;
+
+    /// The backends of this machine.
+    fn backends() -> Vec<Box<dyn Kernels>> {
+        let mut all: Vec<Box<dyn Kernels>> = Vec::new();
+        Avx2::detect().into_iter().for_each(|token| all.push(Box::new(token)));
+        Avx512Vnni::detect().into_iter().for_each(|token| all.push(Box::new(token)));
+        std::println!("{} of 2 backends are here", all.len());
+        all
+    }
+
+    /// An epilogue that no compiler writes.
+    const HOSTILE: RescaleArgs<'static> = RescaleArgs {
+        pre_shift: 255,
+        bias: &[i32::MIN, i32::MAX],
+        multipliers: &[i32::MIN, i32::MAX],
+        shifts: &[255, 0],
+        zero_point: i16::MIN,
+        clamp: Clamp { min: i16::MAX, max: i16::MIN },
+        residual: ResidualArgs::Scaled { codes: None, zero_point: i16::MIN, multipliers: &[i32::MIN, i32::MIN] },
+    };
+
+    #[test]
+    fn hostile_constants_and_lengths_do_not_panic() {
+        let shape = Shape::map(3, 3, 2);
+        let one = Window::square(1, 1, 0);
+        let weights = [-128; 64 + 16 * 64];
+        for kernels in backends() {
+            let args = Conv2dArgs {
+                input_shape: shape,
+                output_shape: shape,
+                window: one,
+                groups: 1,
+                kernel: KernelId::K4N16,
+                weights: &weights,
+                padding_codes: &[],
+                rescale: HOSTILE,
+            };
+            let (input, mut output, mut scratch) = ([-128; 18], [i16::MIN; 18], vec![0; 6 * 192]);
+            kernels.conv2d(&args, &input, CodesMut::I16(&mut output), &mut scratch);
+            assert_eq!(output, [i16::MIN; 18], "the upper bound wins");
+            let short = RescaleArgs { bias: &[], ..HOSTILE };
+            for args in [
+                Conv2dArgs { rescale: short, ..args },
+                Conv2dArgs { groups: 0, ..args },
+                Conv2dArgs { groups: 2, ..args },
+                Conv2dArgs { weights: &[], ..args },
+                Conv2dArgs { weights: &weights[1..], ..args },
+                Conv2dArgs { input_shape: Shape::map(0, 3, 2), ..args },
+                Conv2dArgs { output_shape: Shape::map(3, 0, 2), ..args },
+                Conv2dArgs { output_shape: Shape::map(u16::MAX, u16::MAX, u16::MAX), ..args },
+                Conv2dArgs { window: Window { kernel_h: 0, ..one }, ..args },
+                Conv2dArgs { window: Window { kernel_h: 255, dilation_h: 255, pad_top: 255, ..one }, ..args },
+                Conv2dArgs { window: Window { stride_h: 0, stride_w: 255, pad_left: 255, ..one }, ..args },
+            ] {
+                kernels.conv2d(&args, &input, CodesMut::I16(&mut output), &mut scratch);
+                kernels.conv2d(&args, &input, CodesMut::I8(&mut [0; 18]), &mut []);
+                kernels.conv2d(&args, &[], CodesMut::I8(&mut []), &mut scratch);
+            }
+            for (positions, inputs, outputs) in [(2, 9, 2), (1, 18, 1), (0, 3, 1), (3, 0, 0), (u32::MAX, u16::MAX, 1)] {
+                let kernel = KernelId::K4N16;
+                let args =
+                    LinearArgs { positions, inputs, outputs, kernel, weights: &weights, wide: false, rescale: HOSTILE };
+                kernels.linear(&args, Codes::I8(&input), CodesMut::I8(&mut [i8::MIN; 4]), &mut scratch);
+                kernels.linear(&args, Codes::I16(&[i16::MIN; 18]), CodesMut::I16(&mut [i16::MIN; 4]), &mut scratch);
+                kernels.linear(&args, Codes::I8(&[]), CodesMut::I8(&mut [i8::MIN; 1]), &mut scratch);
+            }
+        }
     }
 }

@@ -29,7 +29,7 @@ impl Tile for Avx2 {
         unsafe { accumulate(operands, sums) }
     }
 
-    fn finish<T: Code>(self, epilogue: &Epilogue<'_>, sums: &[i32; CHANNELS], first: usize, output: &mut [T]) {
+    fn finish<T: Code>(self, epilogue: &Epilogue<'_>, sums: &[[i32; CHANNELS]], first: usize, output: &mut [T]) {
         // SAFETY: the token proves that the instructions exist.
         unsafe { finish(epilogue, sums, first, output) }
     }
@@ -43,7 +43,7 @@ fn widen(codes: &[i8], row: &mut [i16]) {
 }
 
 #[target_feature(enable = "avx2")]
-fn finish<T: Code>(epilogue: &Epilogue<'_>, sums: &[i32; CHANNELS], first: usize, output: &mut [T]) {
+fn finish<T: Code>(epilogue: &Epilogue<'_>, sums: &[[i32; CHANNELS]], first: usize, output: &mut [T]) {
     epilogue.finish(sums, first, output);
 }
 

@@ -31,7 +31,7 @@ impl Tile for Avx512Vnni {
         }
     }
 
-    fn finish<T: Code>(self, epilogue: &Epilogue<'_>, sums: &[i32; CHANNELS], first: usize, output: &mut [T]) {
+    fn finish<T: Code>(self, epilogue: &Epilogue<'_>, sums: &[[i32; CHANNELS]], first: usize, output: &mut [T]) {
         // SAFETY: the token proves that the instructions exist.
         unsafe { finish(epilogue, sums, first, output) }
     }
@@ -45,7 +45,7 @@ fn widen(codes: &[i8], row: &mut [u8]) {
 }
 
 #[target_feature(enable = "avx512f,avx512bw,avx512dq,avx512vl")]
-fn finish<T: Code>(epilogue: &Epilogue<'_>, sums: &[i32; CHANNELS], first: usize, output: &mut [T]) {
+fn finish<T: Code>(epilogue: &Epilogue<'_>, sums: &[[i32; CHANNELS]], first: usize, output: &mut [T]) {
     epilogue.finish(sums, first, output);
 }
 

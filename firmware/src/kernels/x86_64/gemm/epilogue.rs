@@ -1,4 +1,4 @@
-//! From the sums of one row to output codes, 16 channels at a time: [`crate::program::Rescale`] in loops over arrays that
+//! From the sums of a tile to output codes, 16 channels at a time: [`crate::program::Rescale`] in loops over arrays that
 //! the compiler turns into the vector instructions of whoever inlines them.
 //!
 //! Unlike the portable epilogue it holds `acc` and `R(acc, p)` in 32 bits. Under the compiler's bound on partial sums
@@ -10,11 +10,14 @@ use crate::kernels::k4n16::OUTPUTS;
 use crate::kernels::portable::codes::{Code, operand_len};
 use crate::kernels::{RescaleArgs, ResidualArgs};
 use crate::tensor::Codes;
+use core::ops::Range;
 
 /// The constants of up to [`CHANNELS`] output channels; beyond them zeros.
 pub(in super::super) struct Epilogue<'a> {
     rescale: &'a RescaleArgs<'a>,
-    channels: usize,
+    channels: Range<usize>,
+    /// Channels of one position of the output.
+    outputs: usize,
     blocks: [Block; CHANNELS / OUTPUTS],
 }
 
@@ -31,9 +34,8 @@ struct Block {
 }
 
 impl<'a> Epilogue<'a> {
-    /// The constants of `count` channels from `first` on; `None` where an array is too short.
-    pub(super) fn new(rescale: &'a RescaleArgs<'a>, first: usize, count: usize) -> Option<Self> {
-        let channels = first..first + count;
+    /// The constants of some of `outputs` channels; `None` where an array is too short.
+    pub(super) fn new(rescale: &'a RescaleArgs<'a>, channels: Range<usize>, outputs: usize) -> Option<Self> {
         let bias = rescale.bias.get(channels.clone())?.chunks(OUTPUTS);
         let multipliers = rescale.multipliers.get(channels.clone())?.chunks(OUTPUTS);
         let shifts = rescale.shifts.get(channels.clone())?.chunks(OUTPUTS);
@@ -47,47 +49,66 @@ impl<'a> Epilogue<'a> {
             }
         }
         if let ResidualArgs::Scaled { multipliers, .. } = rescale.residual {
-            for (block, multipliers) in blocks.iter_mut().zip(multipliers.get(channels)?.chunks(OUTPUTS)) {
+            for (block, multipliers) in blocks.iter_mut().zip(multipliers.get(channels.clone())?.chunks(OUTPUTS)) {
                 block.residual_multipliers.get_mut(..multipliers.len())?.copy_from_slice(multipliers);
             }
         }
-        Some(Self { rescale, channels: count, blocks })
+        Some(Self { rescale, channels, outputs, blocks })
     }
 
-    /// Turns the sums of one row into the codes of `output` from element `first` on. Writes nothing where they or a
-    /// residual are not there.
+    /// Turns sums of positions from `first` on into the codes of `output`. Writes nothing where these or a residual are not
+    /// there.
     #[inline(always)]
-    pub(super) fn finish<T: Code>(&self, sums: &[i32; CHANNELS], first: usize, output: &mut [T]) {
+    pub(super) fn finish<T: Code>(&self, sums: &[[i32; CHANNELS]], first: usize, output: &mut [T]) {
         let len = output.len();
-        let Some(row) = first.checked_add(self.channels).and_then(|end| output.get_mut(first..end)) else { return };
-        let (sums, _) = sums.as_chunks::<OUTPUTS>();
         let offset = i64::from(self.rescale.zero_point);
         match self.rescale.residual {
-            ResidualArgs::None => {
-                for ((codes, sums), block) in row.chunks_mut(OUTPUTS).zip(sums).zip(&self.blocks) {
-                    self.store(codes, |i| self.round(block, i, self.product(block, i, sums)) + offset);
-                }
-            }
-            ResidualArgs::Scaled { codes: residual, zero_point, .. } => {
-                if operand_len(residual, len) != len {
-                    return;
-                }
-                for (n, ((codes, sums), block)) in row.chunks_mut(OUTPUTS).zip(sums).zip(&self.blocks).enumerate() {
-                    let residual = load(residual, first + n * OUTPUTS, codes);
-                    self.store(codes, |i| {
+            ResidualArgs::None => self.each(sums, first, output, |block, sums, _, _| {
+                core::array::from_fn(|i| self.round(block, i, self.product(block, i, sums)) + offset)
+            }),
+            ResidualArgs::Scaled { codes, zero_point, .. } if operand_len(codes, len) == len => {
+                self.each(sums, first, output, |block, sums, at, stored| {
+                    let residual = load(codes, at, stored);
+                    core::array::from_fn(|i| {
                         let difference = i64::from(residual[i] - i32::from(zero_point));
                         let second = difference * i64::from(block.residual_multipliers[i]);
                         self.round(block, i, self.product(block, i, sums).wrapping_add(second)) + offset
-                    });
-                }
+                    })
+                });
             }
-            ResidualArgs::Stream { codes: residual } => {
-                if operand_len(residual, len) != len {
-                    return;
-                }
-                for (n, ((codes, sums), block)) in row.chunks_mut(OUTPUTS).zip(sums).zip(&self.blocks).enumerate() {
-                    let residual = load(residual, first + n * OUTPUTS, codes);
-                    self.store(codes, |i| self.round(block, i, self.product(block, i, sums)) + i64::from(residual[i]));
+            ResidualArgs::Stream { codes } if operand_len(codes, len) == len => {
+                self.each(sums, first, output, |block, sums, at, stored| {
+                    let residual = load(codes, at, stored);
+                    core::array::from_fn(|i| {
+                        self.round(block, i, self.product(block, i, sums)) + i64::from(residual[i])
+                    })
+                });
+            }
+            ResidualArgs::Scaled { .. } | ResidualArgs::Stream { .. } => {}
+        }
+    }
+
+    /// Stores what `codes` gives for every block of every position, clamped; it sees the block's constants and sums, and
+    /// where its codes lie in the output and what is stored there.
+    #[inline(always)]
+    fn each<T: Code>(
+        &self,
+        sums: &[[i32; CHANNELS]],
+        first: usize,
+        output: &mut [T],
+        codes: impl Fn(&Block, &[i32; OUTPUTS], usize, &[T]) -> [i64; OUTPUTS],
+    ) {
+        let clamp = self.rescale.clamp;
+        for (n, (block, channel)) in self.blocks.iter().zip(self.channels.clone().step_by(OUTPUTS)).enumerate() {
+            let count = OUTPUTS.min(self.channels.end - channel);
+            for (position, sums) in (first..).zip(sums) {
+                let at = position * self.outputs + channel;
+                let sums = sums.as_chunks::<OUTPUTS>().0.get(n);
+                let (Some(stored), Some(sums)) = (output.get_mut(at..at + count), sums) else { return };
+                let results = codes(block, sums, at, stored).map(|code| T::from_code(clamp_code(code, clamp)));
+                match stored.as_mut_array::<OUTPUTS>() {
+                    Some(stored) => *stored = results,
+                    None => stored.iter_mut().zip(results).for_each(|(code, result)| *code = result),
                 }
             }
         }
@@ -106,20 +127,6 @@ impl<'a> Epilogue<'a> {
     #[inline(always)]
     fn round(&self, block: &Block, i: usize, sum: i64) -> i64 {
         sum.wrapping_add(block.halves[i]) >> (block.shifts[i] & 63)
-    }
-
-    /// Clamps and stores what `code` gives for each of up to 16 channels.
-    #[inline(always)]
-    fn store<T: Code>(&self, codes: &mut [T], code: impl Fn(usize) -> i64) {
-        let clamp = self.rescale.clamp;
-        let mut results = [T::ZERO; OUTPUTS];
-        for (i, result) in results.iter_mut().enumerate() {
-            *result = T::from_code(clamp_code(code(i), clamp));
-        }
-        match codes.as_mut_array::<OUTPUTS>() {
-            Some(codes) => *codes = results,
-            None => codes.iter_mut().zip(results).for_each(|(code, result)| *code = result),
-        }
     }
 }
 
