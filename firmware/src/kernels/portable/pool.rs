@@ -27,7 +27,7 @@ pub fn max_pool(args: &PoolArgs, input: Option<Codes<'_>>, output: CodesMut<'_>)
 
 fn max_pool_into<T: Code>(args: &PoolArgs, input: Option<&[T]>, output: &mut [T]) {
     let Some(windows) = Windows::new(args, input.map_or(output.len(), <[T]>::len), output.len()) else { return };
-    let channels = windows.channels;
+    let channels = windows.channels();
     for (pixel, window) in windows.iter().enumerate() {
         for first in (0..channels).step_by(BLOCK) {
             let len = BLOCK.min(channels - first);
@@ -66,9 +66,9 @@ pub fn average_pool(args: &PoolArgs, requant: &RequantArgs, input: Codes<'_>, ou
 fn average_pool_into<I: Code, O: Code>(args: &PoolArgs, requant: &RequantArgs, input: &[I], output: &mut [O]) {
     let Some(windows) = Windows::new(args, input.len(), output.len()) else { return };
     let zero_point = i64::from(requant.input_zero_point);
-    for (pixel, window) in output.chunks_exact_mut(windows.channels).zip(windows.iter()) {
+    for (pixel, window) in output.chunks_exact_mut(windows.channels()).zip(windows.iter()) {
         for (channel, code) in pixel.iter_mut().enumerate() {
-            let sum = window.pixels().filter_map(|tap| input.get(tap * windows.channels + channel));
+            let sum = window.pixels().filter_map(|tap| input.get(tap * windows.channels() + channel));
             *code = requant.code(sum.map(|q| value(*q) - zero_point).sum());
         }
     }
@@ -155,8 +155,8 @@ impl PoolWindow<'_> {
     /// Input pixels that the window covers.
     #[inline]
     fn pixels(&self) -> impl Iterator<Item = usize> {
-        let (width, columns) = (self.windows.input_width, self.windows.columns.taps(self.x));
-        self.windows.rows.taps(self.y).flat_map(move |y| columns.clone().map(move |x| y * width + x))
+        let (rows, columns) = (self.windows.rows.kernel(), self.windows.columns.kernel());
+        (0..rows).flat_map(move |row| (0..columns).filter_map(move |column| self.tap(row, column)))
     }
 
     /// Input pixel of one tap; `None` in the padding.

@@ -98,8 +98,9 @@ mod tests {
     extern crate std;
     use super::super::testing::{for_backends, sum};
     use super::MAX_EPSILON;
-    use crate::kernels::portable::oracle::Buffer;
-    use crate::kernels::{Kernels, LayerNormArgs, Portable};
+    use crate::kernels::portable::oracle::{Buffer, FULL};
+    use crate::kernels::{Kernels, LayerNormArgs, Portable, SumArgs};
+    use crate::tensor::{Codes, CodesMut};
     use std::vec::Vec;
 
     #[test]
@@ -135,6 +136,25 @@ mod tests {
             Portable.layer_norm(&args, input.codes(), expected.codes_mut());
             kernels.layer_norm(&args, input.codes(), output.codes_mut());
             assert_eq!(output, expected, "{rows} x {channels}, epsilon {}, {:?}", args.epsilon, args.sum);
+        });
+    }
+
+    #[test]
+    fn ties_of_the_normalized_value_go_up() {
+        // C·x − S = ±128, V = 2^44: R_σ = 2^22, h = 3, t = R(±2^29, 30).
+        let args = LayerNormArgs {
+            rows: 1,
+            channels: 2,
+            epsilon: (1 << 44) - 2 * (64 * 64 + 64 * 64),
+            gains: &[1; 2],
+            offsets: &[0; 2],
+            sum: SumArgs { shift: 0, zero_point: 0, clamp: FULL },
+        };
+        for_backends(1, |kernels, _| {
+            let (mut expected, mut output) = ([9; 2], [9; 2]);
+            Portable.layer_norm(&args, Codes::I16(&[64, -64]), CodesMut::I16(&mut expected));
+            kernels.layer_norm(&args, Codes::I16(&[64, -64]), CodesMut::I16(&mut output));
+            assert_eq!((output, expected), ([1, 0], [1, 0]));
         });
     }
 }
