@@ -134,10 +134,10 @@ enum Command {
     },
     /// Latency of a model image per step and whole, the backends of this machine side by side.
     ///
-    /// One thread, seeded inputs (no figure depends on them), backends in turns. Times are CPU time of the thread; for
-    /// whole inferences also wall time. Where steps are to be steady, give the process a core of its own: put
-    /// `taskset -c N` in front of the command, and let nothing else run there.
-    #[command(after_help = examples::BENCH)]
+    /// One thread, seeded inputs (no figure depends on them), backends in turns. Times are CPU time of
+    /// the thread; those of whole inferences also wall time. For steady figures give the process a core
+    /// of its own: put `taskset -c N` in front of the command and let nothing else run there.
+    #[command(after_help = examples::BENCH, verbatim_doc_comment)]
     Bench {
         /// Model image.
         #[arg(value_name = "OUT.img")]

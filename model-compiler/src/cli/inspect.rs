@@ -70,7 +70,7 @@ fn image(bytes: &[u8]) -> Result<String> {
         let length = image.section(kind).len().to_string();
         sections.add_row([kind.name().to_owned(), length, format!("{:08x}", image.section_crc(kind))]);
     }
-    let _ = writeln!(text, "{sections}\n");
+    let _ = writeln!(text, "{}\n", sections.trim_fmt());
 
     let mut ports = table(&["port", "name", "type", "shape", "scale", "zero point"], 4);
     let inputs = (0..image.input_count()).filter_map(|i| Some(("input", image.input(i)?)));
@@ -81,7 +81,7 @@ fn image(bytes: &[u8]) -> Result<String> {
         let (scale, zero_point) = (port.scale.to_string(), port.zero_point.to_string());
         ports.add_row([direction, port.name, element_name(record.element), &shape, &scale, &zero_point]);
     }
-    let _ = writeln!(text, "{ports}\n");
+    let _ = writeln!(text, "{}\n", ports.trim_fmt());
 
     let records: Vec<_> =
         (0..image.tensor_count()).filter_map(|i| image.tensor(firmware::tensor::TensorId(i))).collect();
@@ -102,7 +102,7 @@ fn image(bytes: &[u8]) -> Result<String> {
             live.to_string(),
         ]);
     }
-    let _ = writeln!(text, "{steps}");
+    let _ = writeln!(text, "{}", steps.trim_fmt());
     let bound = (0..image.step_count()).map(|p| live_bytes(&records, p)).max().unwrap_or(0);
     let _ = writeln!(text, "\narena {} B, largest live sum {bound} B", image.arena_bytes());
     Ok(text)
@@ -142,7 +142,7 @@ fn qmodel(model: &QModel) -> String {
             step.op.weight_bytes().to_string(),
         ]);
     }
-    let _ = writeln!(text, "{steps}");
+    let _ = writeln!(text, "{}", steps.trim_fmt());
     text
 }
 
@@ -196,7 +196,7 @@ fn tensors(checkpoint: &checkpoint::Checkpoint) -> String {
         let count = tensor.shape.iter().product::<usize>().to_string();
         rows.add_row([tensor.name.clone(), format!("{:?}", tensor.dtype), format!("{:?}", tensor.shape), count]);
     }
-    let _ = writeln!(text, "{rows}");
+    let _ = writeln!(text, "{}", rows.trim_fmt());
     if !checkpoint.skipped().is_empty() {
         let _ = writeln!(text, "\nnot tensors, skipped: {}", checkpoint.skipped().join(", "));
     }
