@@ -25,6 +25,7 @@ use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::path::Path;
 
+mod figures;
 pub mod html;
 pub mod json;
 pub mod memory;

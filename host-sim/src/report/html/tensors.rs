@@ -1,8 +1,8 @@
 //! A card for every step's tensor: its distribution, and the ranges of its channels.
 
-use super::text::{decibels, figure, shape, value};
 use super::{channels, histogram};
 use crate::report::StepReport;
+use crate::report::figures::{decibels, figure, shape, value};
 use maud::{Markup, html};
 
 pub(super) fn section(steps: &[StepReport]) -> Markup {
