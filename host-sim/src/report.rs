@@ -27,6 +27,7 @@ use std::borrow::Cow;
 use std::path::Path;
 
 mod classes;
+mod figures;
 pub mod html;
 pub mod json;
 pub mod memory;

@@ -1,6 +1,7 @@
 //! What a classifier says, for people.
 
-use super::terminal::{figure, table};
+use super::figures::figure;
+use super::terminal::table;
 use crate::ablation::Row;
 use crate::classification::{Accuracy, Classification, ClassificationSummary};
 use crate::run::{Output, RunReport};

@@ -21,7 +21,6 @@ mod plot;
 mod steps;
 mod summary;
 mod tensors;
-mod text;
 mod waypoints;
 
 const STYLE: &str = include_str!("html/style.css");
@@ -101,6 +100,16 @@ fn data(what: &str, table: &Markup) -> Markup {
     }
 }
 
+/// A text that may be broken behind the dots of a name, but not behind those of a figure.
+fn name(text: &str) -> Markup {
+    let is_name = text.starts_with(|c: char| c.is_alphabetic());
+    html! {
+        @if is_name {
+            @for part in text.split_inclusive('.') { (part) @if part.ends_with('.') { wbr; } }
+        } @else { (text) }
+    }
+}
+
 /// A table that scrolls by itself where the page is narrow. The first `words` columns are text, the others figures.
 fn table(header: &[&str], words: usize, rows: &[Vec<String>]) -> Markup {
     let class = |column: usize| if column < words { "w" } else { "n" };
@@ -110,7 +119,7 @@ fn table(header: &[&str], words: usize, rows: &[Vec<String>]) -> Markup {
                 thead { tr { @for (column, name) in header.iter().enumerate() { th class=(class(column)) { (name) } } } }
                 tbody {
                     @for row in rows {
-                        tr { @for (column, cell) in row.iter().enumerate() { td class=(class(column)) { (cell) } } }
+                        tr { @for (column, cell) in row.iter().enumerate() { td class=(class(column)) { (name(cell)) } } }
                     }
                 }
             }

@@ -1,5 +1,6 @@
 //! The forms for people: tables with a line per frame or step, and a short summary.
 
+use super::figures::{figure, signed};
 use super::{FrameReport, StepReport, VerifyReport, classes};
 use crate::ablation::Row;
 use crate::diff::{Diff, FigureChange, MENTIONED_DB, StepChange};
@@ -189,25 +190,6 @@ pub fn gates(gates: &[GateOutcome]) -> String {
     gates.iter().map(line).collect()
 }
 
-/// A difference with its sign; a change from or to exact values is a word.
-fn signed(value: Option<f64>, digits: usize) -> String {
-    match value {
-        Some(value) if value == f64::NEG_INFINITY => "was exact".to_owned(),
-        Some(value) if value == f64::INFINITY => "now exact".to_owned(),
-        Some(value) if value.is_nan() => "lost".to_owned(),
-        Some(value) => format!("{value:+.digits$}").replace('-', "−"),
-        None => "–".to_owned(),
-    }
-}
-
-pub(super) fn figure(value: Option<f64>, digits: usize) -> String {
-    match value {
-        None => "–".to_owned(),
-        Some(value) if value == f64::INFINITY => "exact".to_owned(),
-        Some(value) => format!("{value:.digits$}"),
-    }
-}
-
 /// A table whose columns are aligned right, except those of words.
 pub(super) fn table(header: Vec<String>, words: &[usize], rows: impl Iterator<Item = Vec<String>>) -> String {
     let mut table = Table::new();
@@ -275,12 +257,5 @@ mod tests {
         let gain = lines.iter().position(|line| line.starts_with("+1.5") && line.ends_with("conv1"));
         assert!(loss.unwrap() < gain.unwrap(), "{text}");
         assert!(text.contains("+512") && text.contains("only in the earlier report: conv5"), "{text}");
-    }
-
-    #[test]
-    fn figures_that_are_missing_or_infinite_are_words() {
-        assert_eq!(figure(None, 1), "–");
-        assert_eq!(figure(Some(f64::INFINITY), 1), "exact");
-        assert_eq!(figure(Some(12.345), 2), "12.35");
     }
 }

@@ -1,8 +1,8 @@
 //! What changed against an earlier report.
 
-use super::text::{figure, signed};
 use super::{data, table};
 use crate::diff::{Diff, FigureChange, MENTIONED_DB, StepChange};
+use crate::report::figures::{figure, signed};
 use maud::{Markup, html};
 
 /// Changed steps that are shown without unfolding.

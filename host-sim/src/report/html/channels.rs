@@ -2,9 +2,9 @@
 
 use super::plot::px;
 use super::table;
-use super::text::{figure, value};
 use crate::channels::Channels;
 use crate::report::StepReport;
+use crate::report::figures::{figure, value};
 use maud::{Markup, html};
 
 const WIDTH: f64 = 640.0;

@@ -1,8 +1,8 @@
 //! Every frame, the worst first.
 
 use super::table;
-use super::text::figure;
 use crate::report::FrameReport;
+use crate::report::figures::figure;
 use maud::{Markup, html};
 
 pub(super) fn section(frames: &[FrameReport]) -> Markup {

@@ -1,9 +1,9 @@
 //! Noise along the network: of every step alone, and what has added up.
 
 use super::plot::{Axis, LEFT, RIGHT, WIDTH, line, px};
-use super::text::{decibels, figure};
 use super::{data, table};
 use crate::report::StepReport;
+use crate::report::figures::{decibels, figure};
 use maud::{Markup, html};
 
 const HEIGHT: f64 = 420.0;
@@ -48,10 +48,10 @@ fn lowest(steps: &[StepReport], figure: impl Fn(&StepReport) -> Option<f64>) -> 
 
 fn worst(steps: &[StepReport], figure: impl Fn(&StepReport) -> Option<f64>) -> Markup {
     let row = |(number, (step, db)): (usize, (&StepReport, f64))| {
-        vec![format!("{}. {}", number + 1, step.step), step.op.clone().into_owned(), decibels(Some(db))]
+        vec![(number + 1).to_string(), step.step.clone(), step.op.clone().into_owned(), decibels(Some(db))]
     };
     let rows: Vec<_> = lowest(steps, figure).into_iter().enumerate().map(row).collect();
-    table(&["step", "operator", "SQNR"], 2, &rows)
+    table(&["", "step", "operator", "SQNR"], 3, &rows)
 }
 
 fn plot(steps: &[StepReport]) -> Markup {

@@ -1,9 +1,9 @@
 //! Distribution of a tensor: f32 against integers, with the lines where codes end.
 
 use super::plot::px;
-use super::text::value;
 use crate::histogram::Histogram;
 use crate::report::StepReport;
+use crate::report::figures::value;
 use maud::{Markup, html};
 
 /// Ten units per bin: with whole coordinates, paths are short.

@@ -1,9 +1,9 @@
 //! The arena over time: where every buffer lies, from which step to which.
 
 use super::plot::{Axis, LEFT, RIGHT, WIDTH, px};
-use super::text::{bytes, short_bytes, short_name};
 use super::{data, table};
 use crate::report::Summary;
+use crate::report::figures::{bytes, short_bytes, short_name};
 use crate::report::memory::{Buffer, MemoryReport};
 use maud::{Markup, html};
 

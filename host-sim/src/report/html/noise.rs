@@ -1,9 +1,9 @@
 //! Which tensors the noise at the output comes from.
 
 use super::plot::px;
-use super::text::{decibels, figure};
-use super::{data, table};
+use super::{data, name, table};
 use crate::noise::{NoiseShare, NoiseShares};
+use crate::report::figures::{decibels, figure};
 use maud::{Markup, html};
 
 /// Bars that are drawn; the table has all.
@@ -29,7 +29,7 @@ pub(super) fn section(noise: &NoiseShares) -> Markup {
         div.bars {
             @for share in noise.shares.iter().take(SHOWN) {
                 div title={ "alone " (decibels(share.alone_sqnr_db)) } {
-                    span.label { (share.step) }
+                    span.label { (name(&share.step)) }
                     svg viewBox="0 0 100 10" preserveAspectRatio="none" aria-hidden="true" {
                         rect x="0" y="1" height="8" width=(px(100.0 * share.share / widest)) {}
                     }

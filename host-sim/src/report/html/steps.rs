@@ -1,8 +1,8 @@
 //! Every figure of every step.
 
-use super::text::{figure, shape, value};
 use super::{data, table};
 use crate::report::StepReport;
+use crate::report::figures::{figure, shape, value};
 use maud::{Markup, html};
 
 const HEADER: [&str; 14] = [

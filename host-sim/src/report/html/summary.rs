@@ -1,7 +1,7 @@
 //! What ran, whether it passed, and the figures to remember.
 
-use super::text::{bytes, decibels, figure};
 use crate::report::VerifyReport;
+use crate::report::figures::{bytes, decibels, figure};
 use maud::{Markup, html};
 
 pub(super) fn section(report: &VerifyReport) -> Markup {

@@ -1,8 +1,8 @@
 //! A card for every step's tensor: its distribution, and the ranges of its channels.
 
-use super::text::{decibels, figure, shape, value};
 use super::{channels, histogram};
 use crate::report::StepReport;
+use crate::report::figures::{decibels, figure, shape, value};
 use maud::{Markup, html};
 
 pub(super) fn section(steps: &[StepReport]) -> Markup {
@@ -14,7 +14,8 @@ pub(super) fn section(steps: &[StepReport]) -> Markup {
         "Distribution of every step's values: the " b { "filled area" } " is the f32 network, the " b { "line" } " the "
         "engine's integers, the " b { "dashed lines" } " the least and greatest value that a code can hold. Counts are "
         "logarithmic. What lies beyond a dashed line is clipped. Below it, for a weighted step, the range of each output "
-        "channel, narrowest first: a channel much narrower than the widest uses few of the codes."
+        "channel, narrowest first: a channel much narrower than the widest uses few of the codes. The counts are in "
+        code { "report.json" } "."
     };
     let content = html! {
         div #tensor-list {

@@ -1,9 +1,9 @@
 //! Where both networks would drive: over the LiDAR histogram, with the camera beside it, worst frame first.
 
 use super::plot::{line, px};
-use super::text::figure;
 use super::{data, table};
 use crate::report::FrameReport;
+use crate::report::figures::figure;
 use crate::run::Waypoints;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;

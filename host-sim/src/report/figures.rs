@@ -1,7 +1,7 @@
-//! Figures as people read them.
+//! Figures as people read them, in text and on the page.
 
 /// A figure with so many digits; `–` where there is none.
-pub(super) fn figure(value: Option<f64>, digits: usize) -> String {
+pub(crate) fn figure(value: Option<f64>, digits: usize) -> String {
     match value {
         None => "–".to_owned(),
         Some(value) if value == f64::INFINITY => "exact".to_owned(),
@@ -11,7 +11,7 @@ pub(super) fn figure(value: Option<f64>, digits: usize) -> String {
 }
 
 /// Decibels with their unit.
-pub(super) fn decibels(value: Option<f64>) -> String {
+pub(crate) fn decibels(value: Option<f64>) -> String {
     match value {
         Some(db) if db.is_finite() => format!("{} dB", figure(value, 1)),
         _ => figure(value, 1),
@@ -19,24 +19,26 @@ pub(super) fn decibels(value: Option<f64>) -> String {
 }
 
 /// A difference with its sign.
-pub(super) fn signed(value: Option<f64>, digits: usize) -> String {
+pub(crate) fn signed(value: Option<f64>, digits: usize) -> String {
     match value {
         Some(value) if value == f64::NEG_INFINITY => "was exact".to_owned(),
         Some(value) if value == f64::INFINITY => "now exact".to_owned(),
+        // What rounds to zero has no sign.
+        Some(value) if value.abs() < 0.5 * 0.1_f64.powi(digits as i32) => format!("{:.digits$}", 0.0),
         Some(value) if value.is_finite() => format!("{value:+.digits$}").replace('-', "−"),
         _ => figure(value, digits),
     }
 }
 
 /// Bytes in groups of three digits.
-pub(super) fn bytes(bytes: u64) -> String {
+pub(crate) fn bytes(bytes: u64) -> String {
     let digits = bytes.to_string();
     let groups: Vec<&str> = digits.as_bytes().rchunks(3).rev().map(|g| std::str::from_utf8(g).unwrap_or("")).collect();
     format!("{}\u{202f}B", groups.join("\u{202f}"))
 }
 
 /// Bytes in their largest unit, for axes.
-pub(super) fn short_bytes(bytes: f64) -> String {
+pub(crate) fn short_bytes(bytes: f64) -> String {
     match bytes {
         b if b >= 1_048_576.0 => {
             format!("{:.4}", b / 1_048_576.0).trim_end_matches('0').trim_end_matches('.').to_owned() + " MiB"
@@ -47,11 +49,11 @@ pub(super) fn short_bytes(bytes: f64) -> String {
 }
 
 /// A real value in few characters.
-pub(super) fn value(value: f64) -> String {
+pub(crate) fn value(value: f64) -> String {
     let magnitude = value.abs();
     let text = match magnitude {
         0.0 => "0".to_owned(),
-        m if m >= 1e5 || m < 1e-3 => format!("{value:.1e}"),
+        m if !(1e-3..1e5).contains(&m) => format!("{value:.1e}"),
         m if m >= 100.0 => format!("{value:.0}"),
         m if m >= 1.0 => format!("{value:.2}"),
         _ => format!("{value:.4}"),
@@ -60,7 +62,7 @@ pub(super) fn value(value: f64) -> String {
 }
 
 /// The end of a dotted name that still says something: `blocks.0` of `encoder.blocks.0`.
-pub(super) fn short_name(name: &str) -> &str {
+pub(crate) fn short_name(name: &str) -> &str {
     let is_number = |part: &str| part.bytes().all(|byte| byte.is_ascii_digit());
     let mut start = name.len();
     for part in name.rsplit('.') {
@@ -74,7 +76,7 @@ pub(super) fn short_name(name: &str) -> &str {
 }
 
 /// `64×64×16`.
-pub(super) fn shape([height, width, channels]: [u16; 3]) -> String {
+pub(crate) fn shape([height, width, channels]: [u16; 3]) -> String {
     format!("{height}×{width}×{channels}")
 }
 
@@ -87,6 +89,10 @@ mod tests {
         assert_eq!((decibels(Some(12.34)), decibels(Some(f64::INFINITY))), ("12.3 dB".into(), "exact".into()));
         assert_eq!((figure(None, 1), figure(Some(f64::NAN), 1)), ("–".into(), "not a number".into()));
         assert_eq!((signed(Some(-1.26), 1), signed(Some(f64::NEG_INFINITY), 1)), ("−1.3".into(), "was exact".into()));
+        assert_eq!(
+            (signed(Some(-0.04), 1), signed(Some(0.0), 0), signed(None, 1)),
+            ("0.0".into(), "0".into(), "–".into())
+        );
         assert_eq!((bytes(1_572_876), bytes(12)), ("1\u{202f}572\u{202f}876\u{202f}B".into(), "12\u{202f}B".into()));
         assert_eq!((short_bytes(1_572_864.0), short_bytes(65_536.0)), ("1.5 MiB".into(), "64 KiB".into()));
         assert_eq!((short_name("a.layer1.0"), short_name("a.relu"), short_name("7")), ("layer1.0", "relu", "7"));
