@@ -23,6 +23,8 @@ pub mod ranges;
 mod softmax;
 mod sums;
 pub mod tables;
+#[cfg(test)]
+mod tests;
 mod token;
 pub mod types;
 mod weighted;

@@ -8,6 +8,7 @@ pub mod golden;
 pub mod mutation;
 pub mod project;
 pub mod random;
+pub mod random_graph;
 pub mod sketch;
 pub mod torch_file;
 pub mod trial;
