@@ -521,7 +521,7 @@ impl Axis {
     pub const fn run(self, shape: Shape) -> u64 {
         match self {
             Self::Height => shape.elements(),
-            Self::Width => shape.width as u64 * shape.channels as u64,
+            Self::Width => (shape.width as u64).saturating_mul(shape.channels as u64),
             Self::Channels => shape.channels as u64,
         }
     }
