@@ -12,6 +12,7 @@ use model_compiler::frames::Frame;
 use model_compiler::import::System;
 use model_compiler::ir::Graph;
 use model_compiler::pipeline::Compiled;
+use model_compiler::qmodel::QModel;
 use model_compiler::quantize::{QuantizeOptions, SkipStages};
 use tests::build;
 use tests::golden::{self, Network};
@@ -37,9 +38,8 @@ fn assert_self_test_passes(compiled: &Compiled) {
     engine.self_test().unwrap_or_else(|e| panic!("{e}"));
 }
 
-fn compile(graph: &Graph, skip: SkipStages) -> Compiled {
-    let options = QuantizeOptions { skip, ..Default::default() };
-    build::compiled(&build::quantized(graph, &options))
+fn quantized(graph: &Graph, skip: SkipStages) -> QModel {
+    build::quantized(graph, &QuantizeOptions { skip, ..Default::default() })
 }
 
 #[test]
@@ -48,11 +48,14 @@ fn small_networks_are_byte_exact() {
         let network = Network::small(system);
         let graph = build::small(&network);
         for skip in [SkipStages::narrow(), SkipStages::wide()] {
-            let compiled = compile(&graph, skip);
-            for backend in Backend::all() {
-                assert_byte_exact(&compiled, &build::frames_of(&graph), backend);
+            let model = quantized(&graph, skip);
+            for target in ["portable", "x86"] {
+                let compiled = build::compiled_for(&model, target);
+                for backend in Backend::all() {
+                    assert_byte_exact(&compiled, &build::frames_of(&graph), backend);
+                }
+                assert_self_test_passes(&compiled);
             }
-            assert_self_test_passes(&compiled);
         }
     }
 }
@@ -61,9 +64,16 @@ fn small_networks_are_byte_exact() {
 fn full_size_networks_are_byte_exact() {
     for system in SYSTEMS {
         let graph = build::graph(golden::checkpoint(system));
-        let compiled = compile(&graph, SkipStages::narrow());
+        let model = quantized(&graph, SkipStages::narrow());
+        let compiled = build::compiled(&model);
         let fastest = Backend::choose(None).unwrap_or_else(|e| panic!("{e}"));
         assert_byte_exact(&compiled, &build::frames_of(&graph), fastest);
         assert_self_test_passes(&compiled);
+        if system == System::TransFuser {
+            let compiled = build::compiled_for(&model, "x86");
+            for backend in Backend::all() {
+                assert_byte_exact(&compiled, &build::frames_of(&graph)[..1], backend);
+            }
+        }
     }
 }

@@ -232,4 +232,36 @@ fn help_and_version_are_results() {
         &["--calib", "--target", "--ram", "--no-in-place-pooling"],
     );
     assert_holds(&folder.ok("host-sim verify --help"), &["--min-sqnr", "--mirror", "--record", "--json"]);
+    assert_holds(&folder.ok("host-sim bench --help"), &["--rounds", "--backend", "avx512-vnni", "taskset"]);
+}
+
+#[test]
+fn every_shell_gets_a_script_that_knows_the_commands() {
+    let folder = Folder::default();
+    for shell in ["bash", "elvish", "fish", "powershell", "zsh"] {
+        let script = folder.ok(&format!("model-compiler completions {shell}"));
+        assert_holds(&script, &["model-compiler", "quantize", "calib", "no-in-place-pooling"]);
+        let script = folder.ok(&format!("host-sim completions {shell}"));
+        assert_holds(&script, &["host-sim", "verify", "min-sqnr", "bench"]);
+    }
+    for program in ["model-compiler", "host-sim"] {
+        let outcome = folder.run(&format!("{program} completions tcl"));
+        assert_eq!((outcome.status, outcome.out.as_str()), (2, ""));
+        assert_holds(&outcome.err, &["invalid value 'tcl'", "powershell"]);
+    }
+}
+
+#[test]
+fn what_was_meant_is_suggested() {
+    let folder = Folder::default();
+    for (command, meant) in [
+        ("model-compiler inspcet @net.img", "'inspect'"),
+        ("model-compiler compile @net.qmodel --tagret cortex-m7 -o @net.img", "'--target'"),
+        ("host-sim verfy @net.img", "'verify'"),
+        ("host-sim run @net.img --frame @frames", "'--frames'"),
+    ] {
+        let outcome = folder.run(command);
+        assert_eq!((outcome.status, outcome.out.as_str()), (2, ""), "{command}");
+        assert!(outcome.err.contains("similar") && outcome.err.contains(meant), "{command}: {}", outcome.err);
+    }
 }

@@ -29,7 +29,7 @@
 //! * [`ops`]: one operator per file: what its step must satisfy, and how it becomes a call of a kernel.
 //! * [`arena`]: the operands of a step as disjoint slices of one buffer, by checked means only.
 //! * [`kernels`]: one method per operator; [`kernels::portable`] is the norm, other backends equal it byte for byte.
-//!   [`kernels::plan`] tells compiler and runtime what a kernel needs.
+//!   [`kernels::plan`] tells compiler and runtime what a kernel needs. Under the feature `conformance` a sweep proves it.
 //! * [`image`] and [`program`]: the file format, its checks, and the steps. The compiler writes what these define.
 //! * [`waypoint`]: the network's result as a controller reads it.
 //! * [`tensor`] and [`fixed_point`]: shapes, types and the one arithmetic.
@@ -55,6 +55,8 @@
 compile_error!("model images are little-endian and executed in place");
 
 pub mod arena;
+#[cfg(any(test, feature = "conformance"))]
+pub mod conformance;
 pub mod engine;
 pub mod fault;
 pub mod fixed_point;

@@ -142,7 +142,7 @@ fn verified(bundle: &Bundle, image: PathBuf, progress: &ProgressBar) -> Result<V
         record: None,
         model: Some(bundle.checkpoint()),
         import: ImportOptions::default(),
-        frames: FrameSource { frames: Some(bundle.frames("evaluation")), inputs: None },
+        frames: FrameSource { frames: Some(bundle.frames("evaluation")), ..FrameSource::default() },
         backend: Backend::choose(None)?,
         mirror: true,
         gates: Gates::default(),

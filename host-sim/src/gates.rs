@@ -4,6 +4,8 @@
 //! min_sqnr_db = 15              # every step, accumulated
 //! min_output_sqnr_db = 18       # the first output
 //! max_waypoint_error_mm = 120   # every waypoint of every frame
+//! min_agreement_percent = 98.5  # of a classifier: frames on which int8 and f32 give one class
+//! min_top1_percent = 91         # of a classifier: frames on which the class is the label
 //! max_arena_bytes = 245760
 //! max_flash_bytes = 2097152
 //! max_loss_db = 1               # no step against the baseline
@@ -14,6 +16,7 @@
 //!
 //! Every field may be absent. A figure that is not a number misses every gate.
 
+use crate::classification::ClassificationSummary;
 use crate::diff::Diff;
 use crate::report::{StepReport, VerifyReport, worst};
 use glob::Pattern;
@@ -34,6 +37,10 @@ pub struct Gates {
     pub min_output_sqnr_db: Option<f64>,
     /// Largest waypoint error of any frame, mm.
     pub max_waypoint_error_mm: Option<f64>,
+    /// Fewest frames on which a classifier in int8 and in f32 gives one class, percent.
+    pub min_agreement_percent: Option<f64>,
+    /// Fewest frames on which the class is the label, percent.
+    pub min_top1_percent: Option<f64>,
     /// Largest arena.
     pub max_arena_bytes: Option<u64>,
     /// Largest image.
@@ -77,9 +84,9 @@ pub fn failure(gates: &[GateOutcome]) -> Option<Error> {
 }
 
 impl GateOutcome {
-    fn at_least(gate: &str, place: Option<String>, found: Option<f64>, limit: f64) -> Self {
+    fn at_least(gate: &str, place: Option<String>, found: Option<f64>, limit: f64, unit: &'static str) -> Self {
         let met = found.is_some_and(|found| found >= limit);
-        Self { gate: gate.into(), place, found, limit, at_least: true, unit: "dB".into(), met }
+        Self { gate: gate.into(), place, found, limit, at_least: true, unit: unit.into(), met }
     }
 
     fn at_most(gate: &str, place: Option<String>, found: Option<f64>, limit: f64, unit: &'static str) -> Self {
@@ -108,6 +115,8 @@ struct File {
     min_sqnr_db: Option<Spanned<f64>>,
     min_output_sqnr_db: Option<Spanned<f64>>,
     max_waypoint_error_mm: Option<Spanned<f64>>,
+    min_agreement_percent: Option<Spanned<f64>>,
+    min_top1_percent: Option<Spanned<f64>>,
     max_arena_bytes: Option<u64>,
     max_flash_bytes: Option<u64>,
     max_loss_db: Option<Spanned<f64>>,
@@ -115,8 +124,16 @@ struct File {
     steps: BTreeMap<Spanned<String>, Spanned<f64>>,
 }
 
-const FIELDS: &str = "fields: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm, max_arena_bytes, \
-                      max_flash_bytes, max_loss_db, [steps] with \"PATTERN\" = dB";
+/// What a percentage must be: a share such as 0.9 would be a gate that nothing ever misses.
+pub const PERCENTAGE: &str = "a percentage above 1 up to 100, such as 98.5";
+
+/// Whether a number is a [`PERCENTAGE`].
+pub fn is_percentage(value: f64) -> bool {
+    value > 1.0 && value <= 100.0
+}
+
+const FIELDS: &str = "fields: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm, min_agreement_percent, \
+                      min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, [steps] with \"PATTERN\" = dB";
 
 impl Gates {
     /// Reads a gate file.
@@ -150,6 +167,9 @@ impl Gates {
         let distance = |field: &str, value: Option<Spanned<f64>>, expected| {
             value.map(|value| checked(field, value, |v| v.is_finite() && v >= 0.0, expected)).transpose()
         };
+        let share = |field: &str, value: Option<Spanned<f64>>| {
+            value.map(|value| checked(field, value, is_percentage, PERCENTAGE)).transpose()
+        };
         let step = |(name, value): (Spanned<String>, Spanned<f64>)| {
             let field = format!("steps.{:?}", name.get_ref());
             let pattern = Pattern::new(name.get_ref())
@@ -164,6 +184,8 @@ impl Gates {
                 file.max_waypoint_error_mm,
                 "millimeters, 0 or more",
             )?,
+            min_agreement_percent: share("min_agreement_percent", file.min_agreement_percent)?,
+            min_top1_percent: share("min_top1_percent", file.min_top1_percent)?,
             max_arena_bytes: file.max_arena_bytes,
             max_flash_bytes: file.max_flash_bytes,
             max_loss_db: distance("max_loss_db", file.max_loss_db, "decibels, 0 or more")?,
@@ -178,6 +200,8 @@ impl Gates {
             min_sqnr_db: self.min_sqnr_db.or(other.min_sqnr_db),
             min_output_sqnr_db: self.min_output_sqnr_db.or(other.min_output_sqnr_db),
             max_waypoint_error_mm: self.max_waypoint_error_mm.or(other.max_waypoint_error_mm),
+            min_agreement_percent: self.min_agreement_percent.or(other.min_agreement_percent),
+            min_top1_percent: self.min_top1_percent.or(other.min_top1_percent),
             max_arena_bytes: self.max_arena_bytes.or(other.max_arena_bytes),
             max_flash_bytes: self.max_flash_bytes.or(other.max_flash_bytes),
             max_loss_db: self.max_loss_db.or(other.max_loss_db),
@@ -195,6 +219,7 @@ impl Gates {
             ("min_sqnr_db (--min-sqnr)", self.min_sqnr_db.is_some()),
             ("min_output_sqnr_db (--min-output-sqnr)", self.min_output_sqnr_db.is_some()),
             ("max_waypoint_error_mm", self.max_waypoint_error_mm.is_some()),
+            ("min_agreement_percent (--min-agreement)", self.min_agreement_percent.is_some()),
             ("max_loss_db (--max-loss)", self.max_loss_db.is_some()),
             ("steps", !self.steps.is_empty()),
         ];
@@ -232,7 +257,7 @@ impl Gates {
         }
         if let Some(limit) = self.min_output_sqnr_db {
             let place = summary.output_step.as_ref().map(|step| format!("step {step}"));
-            outcomes.push(GateOutcome::at_least("min_output_sqnr_db", place, summary.output_sqnr_db, limit));
+            outcomes.push(GateOutcome::at_least("min_output_sqnr_db", place, summary.output_sqnr_db, limit, "dB"));
         }
         if let Some(limit) = self.max_waypoint_error_mm {
             let largest = summary.waypoint_error_mm.iter().enumerate().max_by(|a, b| a.1.max.total_cmp(&b.1.max));
@@ -240,6 +265,7 @@ impl Gates {
             let found = largest.map(|(_, error)| error.max);
             outcomes.push(GateOutcome::at_most("max_waypoint_error_mm", place, found, limit, "mm"));
         }
+        outcomes.extend(self.class_outcomes(summary.accuracy.as_ref())?);
         let sizes = [
             ("max_arena_bytes", summary.arena_bytes, self.max_arena_bytes),
             ("max_flash_bytes", summary.flash_bytes, self.max_flash_bytes),
@@ -249,6 +275,28 @@ impl Gates {
         }
         if let (Some(limit), Some(diff)) = (self.max_loss_db, &report.baseline) {
             outcomes.push(loss(diff, limit));
+        }
+        Ok(outcomes)
+    }
+}
+
+impl Gates {
+    /// What the gates of a classifier meet.
+    fn class_outcomes(&self, found: Option<&ClassificationSummary>) -> Result<Vec<GateOutcome>> {
+        let agreement = found.and_then(|found| found.agreement.as_ref()).map(|agreement| agreement.share);
+        let top1 = found.and_then(|found| found.int8.as_ref()).map(|accuracy| accuracy.top1);
+        let gates = [
+            ("min_agreement_percent", self.min_agreement_percent, agreement, "add --model MODEL"),
+            ("min_top1_percent", self.min_top1_percent, top1, "label the frames: labels.csv, or tensor `label`"),
+        ];
+        let mut outcomes = Vec::new();
+        for (gate, limit, share, help) in gates {
+            let Some(limit) = limit else { continue };
+            let share = share.ok_or_else(|| {
+                let message = "this was not measured: it needs a classifier and what it is compared with";
+                Error::new(ErrorCode::Usage, format!("gate {gate}"), message).with_help(help)
+            })?;
+            outcomes.push(GateOutcome::at_least(gate, None, Some(100.0 * share), limit, "%"));
         }
         Ok(outcomes)
     }
@@ -266,7 +314,7 @@ pub fn loss(diff: &Diff, limit: f64) -> GateOutcome {
 fn lowest(gate: &str, steps: &[StepReport], limit: f64) -> GateOutcome {
     let worst = worst(steps);
     let place = worst.map(|step| format!("step {} {}", step.position, step.step));
-    GateOutcome::at_least(gate, place, worst.and_then(|step| step.sqnr_db), limit)
+    GateOutcome::at_least(gate, place, worst.and_then(|step| step.sqnr_db), limit, "dB")
 }
 
 #[cfg(test)]

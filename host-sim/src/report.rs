@@ -9,6 +9,7 @@
 //! * steps stand in the order of execution; a step is known by its name, which is unique
 
 use crate::channels::Channels;
+use crate::classification::{ClassificationSummary, ClassifiedFrame};
 use crate::compare::StepDifference;
 use crate::diff::Diff;
 use crate::gates::GateOutcome;
@@ -25,6 +26,7 @@ use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
 use std::path::Path;
 
+mod classes;
 mod figures;
 pub mod html;
 pub mod json;
@@ -108,6 +110,9 @@ pub struct Summary {
     pub arena_status: PlanStatus,
     /// Size of the image, bytes.
     pub flash_bytes: u64,
+    /// Of a classifier: how often it is right, and how near to the f32 network.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub accuracy: Option<ClassificationSummary>,
 }
 
 /// Mean and maximum over the frames, mm.
@@ -193,6 +198,9 @@ pub struct FrameReport {
     pub waypoints: Option<Waypoints>,
     /// Of the f32 network.
     pub reference_waypoints: Option<Waypoints>,
+    /// What a classifier says.
+    #[serde(flatten)]
+    pub classes: Option<ClassifiedFrame>,
     /// Distance of both, per waypoint, mm; empty where one is missing.
     #[serde(default)]
     pub waypoint_error_mm: Vec<f64>,
@@ -306,6 +314,7 @@ pub(crate) mod tests {
                 arena_bound_bytes: 2048,
                 arena_status: PlanStatus::Optimal,
                 flash_bytes: 4096,
+                accuracy: None,
             },
             steps: vec![step(0, Some(30.0)), step(1, Some(21.5))],
             memory: memory::tests::memory(),
@@ -322,6 +331,7 @@ pub(crate) mod tests {
                 output_sqnr_db: Some(21.5),
                 waypoints: Some(vec![[0.0, 1.0]]),
                 reference_waypoints: Some(vec![[0.0, 1.001]]),
+                classes: None,
                 waypoint_error_mm: vec![1.0],
             }],
             gates: vec![],

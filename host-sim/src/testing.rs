@@ -37,6 +37,7 @@ pub fn sample() -> Sample {
             order: vec![0, 1],
             tensors: vec![placement(0, 48, 0, 0), placement(48, 12, 0, 1), placement(64, 6, 1, 1)],
             scratch: vec![None, None],
+            kernels: vec![None, None],
             arena_bytes: 80,
             bound_bytes: 64,
             peak_step: 0,
@@ -68,6 +69,7 @@ pub fn frame(seed: u8) -> Frame {
         goal: None,
         command: None,
         dropped_points: 0,
+        label: None,
     }
 }
 

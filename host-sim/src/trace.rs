@@ -28,7 +28,7 @@ pub struct StepFigures {
     pub accumulated: Option<ErrorSums>,
     /// Codes written.
     pub codes: u64,
-    /// Codes at a clamp bound other than a ReLU's; `None` where the operator cannot saturate.
+    /// Codes at a clamp bound that is not the network's own; `None` where the operator cannot saturate.
     pub saturated: Option<u64>,
     /// Distribution of the values; absent before the first frame.
     pub histogram: Option<Histogram>,
@@ -292,7 +292,7 @@ impl<'a> Tracer<'a> {
             let codes = decode(&run.tensors[step.op.output().0 as usize], tensor.element);
             let figures = &mut self.figures[position];
             figures.codes += codes.len() as u64;
-            if let Some(bounds) = SaturationBounds::of(&step.op) {
+            if let Some(bounds) = SaturationBounds::of(step) {
                 *figures.saturated.get_or_insert(0) += bounds.count(&codes);
             }
         }

@@ -2,6 +2,7 @@
 
 use crate::backends::Backend;
 use crate::channels::Channels;
+use crate::classification::Comparison;
 use crate::codes;
 use crate::diff::Diff;
 use crate::files::{self, FrameSource, ImageFile};
@@ -123,12 +124,18 @@ fn compare_and_measure(
     let known = calibration_digests(&record.model);
     let overlap = frames::overlap(&known, frames);
     let mut waypoint_errors = Vec::new();
+    let is_classifier = FrameFormat::of_model(&record.model).classes.is_some();
+    let mut classes = Comparison::default();
     let mut first_difference = None;
     let mut frame_reports = Vec::new();
     for frame in frames {
         progress.set_message(frame.name.clone());
         let trace = tracer.trace(frame, progress)?;
-        let report = frame_report(record, frame, &trace, overlap.contains(&frame.name.as_str()));
+        let mut report = frame_report(record, frame, &trace, overlap.contains(&frame.name.as_str()));
+        if is_classifier {
+            let reference = trace.reference_outputs.as_ref().map(|outputs| outputs[0].as_slice());
+            report.classes = Some(classes.add(frame, &trace.outputs[0], reference));
+        }
         add_waypoint_errors(&mut waypoint_errors, &report);
         frame_reports.push(report);
         first_difference = trace.difference;
@@ -144,6 +151,7 @@ fn compare_and_measure(
         _ => None,
     };
     let steps = step_reports(record, tracer.figures());
+    let summary = Summary { accuracy: classes.summary(), ..summary(record, &steps, &waypoint_errors) };
     Ok(VerifyReport {
         schema: json::SCHEMA,
         model,
@@ -152,7 +160,7 @@ fn compare_and_measure(
         passed: true,
         bytes_equal: first_difference.is_none(),
         first_difference,
-        summary: summary(record, &steps, &waypoint_errors),
+        summary,
         steps,
         memory: MemoryReport::of(record),
         noise,
@@ -195,6 +203,7 @@ fn frame_report(record: &Record, frame: &Frame, trace: &FrameTrace, calibration:
         waypoint_error_mm: found.as_ref().zip(expected.as_ref()).map(|(f, e)| distances_mm(f, e)).unwrap_or_default(),
         waypoints: found,
         reference_waypoints: expected,
+        classes: None,
     }
 }
 
@@ -269,6 +278,7 @@ fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread]) ->
         arena_bound_bytes: plan.bound_bytes,
         arena_status: plan.status,
         flash_bytes: 0,
+        accuracy: None,
     }
 }
 
@@ -364,7 +374,7 @@ mod tests {
             record: None,
             model: None,
             import: ImportOptions::default(),
-            frames: FrameSource { frames: None, inputs: Some(path("inputs.safetensors")) },
+            frames: FrameSource { inputs: Some(path("inputs.safetensors")), ..FrameSource::default() },
             backend: Backend::choose(None).unwrap(),
             mirror: false,
             gates: Gates::default(),

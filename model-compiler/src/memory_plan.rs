@@ -11,6 +11,7 @@ use crate::qmodel::QModel;
 use crate::qmodel::QTensorId;
 use crate::schedule;
 use crate::target::Target;
+use firmware::program::KernelId;
 use needs::Needs;
 use serde::{Deserialize, Serialize};
 use solver::{Item, Packing, Span};
@@ -73,6 +74,8 @@ pub struct MemoryPlan {
     pub tensors: Vec<Placement>,
     /// Scratch per position of the execution order.
     pub scratch: Vec<Option<Placement>>,
+    /// Kernel per position of the execution order, where the step is weighted.
+    pub kernels: Vec<Option<KernelId>>,
     /// Size of the arena, bytes.
     pub arena_bytes: u64,
     /// Lower bound: the largest sum of live bytes over the steps.
@@ -121,10 +124,10 @@ const MAX_ORDER_NODES: u64 = 250_000;
 /// Largest number of in-place pairs that are tried without, where a plan with all of them misses the bound.
 const MAX_DROPPED_PAIRS: usize = 16;
 
-/// Chooses order, in-place pairs and offsets.
+/// Chooses kernels, order, in-place pairs and offsets.
 ///
 /// # Errors
-/// The alignment is out of range, the target has no known kernel, or the model's steps do not fit together (a tensor
+/// The alignment is out of range, the target lists no kernel, or the model's steps do not fit together (a tensor
 /// written twice or read before it is written).
 pub fn plan(model: &QModel, target: &Target, options: &PlanOptions) -> Result<MemoryPlan> {
     if !options.alignment.is_power_of_two() || !(4..=4096).contains(&options.alignment) {
@@ -141,6 +144,7 @@ pub fn plan(model: &QModel, target: &Target, options: &PlanOptions) -> Result<Me
         order: schedule.order.iter().map(|&s| s as u32).collect(),
         tensors: tensor_placements(&needs, &ranges, &pairs, &items, &packing),
         scratch: scratch_placements(&needs, &schedule.order, &items, &packing),
+        kernels: schedule.order.iter().map(|&step| needs.kernels[step]).collect(),
         arena_bytes: packing.peak,
         bound_bytes: packing.bound,
         peak_step: packing.peak_step,

@@ -6,11 +6,15 @@ use crate::artifact;
 use crate::emit::{ConstantsBuilder, ImageParts, ImagePort};
 use crate::error::{Error, ErrorCode, Result};
 use crate::memory_plan::{MemoryPlan, Placement};
-use crate::qmodel::{Port, QModel, QOp, QRescale, QResidual, QTensorId, QTerm, QTokenSource, QWaypointDecoder};
+use crate::qmodel::{
+    Port, QConcatSource, QModel, QOp, QRescale, QResidual, QTensorId, QTerm, QTokenSource, QWaypointDecoder,
+};
 use firmware::image::TensorRecord;
+use firmware::kernels::{k4n16, plan};
 use firmware::program::{
-    Add, Attention, AveragePool, Conv2d, GlobalPool, KernelId, LayerNorm, Linear, MaxPool, Requantize, Rescale,
-    Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, WaypointDecoder,
+    Add, Attention, AveragePool, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GlobalPool, KernelId, LayerNorm,
+    Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, Step, Term, TokenSource, Tokens,
+    WaypointDecoder,
 };
 use firmware::tensor::TensorId;
 
@@ -21,9 +25,9 @@ const ARENA_ALIGNMENT: u32 = 16;
 ///
 /// # Errors
 /// More tensors, steps or bytes than the image format can hold.
-pub fn pack(model: &QModel, plan: &MemoryPlan) -> Result<ImageParts> {
+pub fn pack(model: &QModel, memory: &MemoryPlan) -> Result<ImageParts> {
     let mut packer = Packer { constants: ConstantsBuilder::new(), tensors: Vec::new() };
-    for (tensor, placement) in model.tensors.iter().zip(&plan.tensors) {
+    for (tensor, placement) in model.tensors.iter().zip(&memory.tensors) {
         let record = TensorRecord {
             element: tensor.element,
             shape: tensor.shape,
@@ -35,10 +39,11 @@ pub fn pack(model: &QModel, plan: &MemoryPlan) -> Result<ImageParts> {
         };
         packer.tensors.push(record);
     }
-    let mut steps = Vec::with_capacity(plan.order.len());
-    for (position, &index) in plan.order.iter().enumerate() {
-        let scratch = packer.scratch(position, plan.scratch[position])?;
-        steps.push(packer.step(&model.steps[index as usize].op, scratch)?);
+    let mut steps = Vec::with_capacity(memory.order.len());
+    for (position, &index) in memory.order.iter().enumerate() {
+        let scratch = packer.scratch(position, memory.scratch[position])?;
+        let kernel = memory.kernels[position].unwrap_or(KernelId::Direct);
+        steps.push(packer.step(model, &model.steps[index as usize].op, kernel, scratch)?);
     }
     let ports = |ports: &[Port]| ports.iter().map(|port| image_port(model, port)).collect::<Result<Vec<_>>>();
     Ok(ImageParts {
@@ -48,8 +53,8 @@ pub fn pack(model: &QModel, plan: &MemoryPlan) -> Result<ImageParts> {
         constants: packer.constants.finish(),
         inputs: ports(&model.inputs)?,
         outputs: ports(&model.outputs)?,
-        arena_bytes: narrow(plan.arena_bytes, "arena bytes")?,
-        arena_alignment: ARENA_ALIGNMENT.max(plan.alignment),
+        arena_bytes: narrow(memory.arena_bytes, "arena bytes")?,
+        arena_alignment: ARENA_ALIGNMENT.max(memory.alignment),
         qmodel_digest: artifact::sha256(&artifact::to_bytes(model)?),
         build_digest: [0; 32],
         known_answer: None,
@@ -84,6 +89,11 @@ fn token_source(source: &QTokenSource) -> Result<TokenSource> {
     Ok(TokenSource { map: tensor_id(map)?, zero_point, pool_h, pool_w, multiplier })
 }
 
+fn concat_source(source: &QConcatSource) -> Result<ConcatSource> {
+    let QConcatSource { tensor, zero_point, requant } = *source;
+    Ok(ConcatSource { tensor: tensor_id(tensor)?, zero_point, requant })
+}
+
 struct Packer {
     constants: ConstantsBuilder,
     tensors: Vec<TensorRecord>,
@@ -100,6 +110,20 @@ impl Packer {
         let id = TensorId(narrow(self.tensors.len(), "tensors")?);
         self.tensors.push(record);
         Ok(Some(id))
+    }
+
+    /// Weights of `groups` groups of `outputs` output channels each, in a kernel's order.
+    fn weights(&mut self, kernel: KernelId, groups: u16, outputs: u16, weights: &[i8]) -> Result<ConstRange> {
+        match kernel {
+            KernelId::Direct => self.constants.push(weights),
+            KernelId::K4N16 => {
+                let depth = weights.len() / (usize::from(groups) * usize::from(outputs)).max(1);
+                let bytes = plan::weight_bytes(kernel, groups, outputs, depth as u64);
+                let mut packed = vec![0; narrow(bytes, "weight bytes")?];
+                k4n16::pack(weights, outputs, depth, &mut packed);
+                self.constants.push(&packed)
+            }
+        }
     }
 
     fn rescale(&mut self, rescale: &QRescale) -> Result<Rescale> {
@@ -122,8 +146,8 @@ impl Packer {
         })
     }
 
-    fn step(&mut self, op: &QOp, scratch: Option<TensorId>) -> Result<Step> {
-        let kernel = KernelId::Direct;
+    fn step(&mut self, model: &QModel, op: &QOp, kernel: KernelId, scratch: Option<TensorId>) -> Result<Step> {
+        let channels = |id: &QTensorId| model.tensor(*id).shape.channels;
         Ok(match op {
             QOp::Conv2d { input, output, window, groups, weights, padding_codes, rescale } => Step::Conv2d(Conv2d {
                 input: tensor_id(*input)?,
@@ -131,7 +155,7 @@ impl Packer {
                 window: *window,
                 groups: *groups,
                 kernel,
-                weights: self.constants.push(weights)?,
+                weights: self.weights(kernel, *groups, channels(output) / (*groups).max(1), weights)?,
                 padding_codes: self.constants.push(padding_codes)?,
                 rescale: self.rescale(rescale)?,
                 scratch,
@@ -140,7 +164,7 @@ impl Packer {
                 input: tensor_id(*input)?,
                 output: tensor_id(*output)?,
                 kernel,
-                weights: self.constants.push(weights)?,
+                weights: self.weights(kernel, 1, channels(output), weights)?,
                 wide: *wide,
                 rescale: self.rescale(rescale)?,
                 scratch,
@@ -248,6 +272,29 @@ impl Packer {
                 })
             }
             QOp::WaypointDecoder(decoder) => Step::WaypointDecoder(self.waypoint_decoder(decoder, scratch)?),
+            QOp::CopyBox { input, output, begin, stride, size, before, border } => Step::CopyBox(CopyBox {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                begin: *begin,
+                stride: *stride,
+                size: *size,
+                before: *before,
+                border: *border,
+            }),
+            QOp::Concat { first, second, output, axis, zero_point, clamp } => Step::Concat(Concat {
+                first: concat_source(first)?,
+                second: concat_source(second)?,
+                output: tensor_id(*output)?,
+                axis: *axis,
+                zero_point: *zero_point,
+                clamp: *clamp,
+            }),
+            QOp::Softmax { input, output, exponent, exp_table } => Step::Softmax(Softmax {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                exponent: *exponent,
+                exp_table: self.constants.push(exp_table)?,
+            }),
         })
     }
 

@@ -194,6 +194,7 @@ mod tests {
             overwritable: overwritable.collect(),
             writes: (2..tensors).collect(),
             scratch: (0..steps).map(|_| 16 * below(2) as u64).collect(),
+            kernels: vec![None; steps],
             reads,
             alignment: 16,
         }

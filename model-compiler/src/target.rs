@@ -6,7 +6,7 @@
 //! name = "my-board"
 //! alignment = 4            # of tensors, bytes; a power of two
 //! flash = "2M"             # bytes, or with K or M (1024, 1024²); absent: unlimited
-//! kernels = ["direct"]     # absent: direct
+//! kernels = ["direct"]     # or "k4n16": what the runtime there has, the best first; absent: direct
 //!
 //! [[regions]]              # RAM; the arena lies in the first
 //! name = "main"
@@ -16,6 +16,7 @@
 use crate::error::{Error, ErrorCode, Result};
 use crate::memory_plan::{MemoryPlan, PlanStatus};
 use crate::qmodel::QModel;
+use firmware::kernels::plan;
 use firmware::program::KernelId;
 use serde::Deserialize;
 use std::fmt::Write as _;
@@ -32,7 +33,7 @@ pub struct Target {
     pub flash_bytes: Option<u64>,
     /// Alignment of tensors in the arena, bytes.
     pub alignment: u32,
-    /// Kernels that the runtime there has; the first is used.
+    /// Kernels that the runtime there has, the best first.
     pub kernels: Vec<KernelId>,
 }
 
@@ -45,9 +46,18 @@ pub struct Region {
     pub bytes: Option<u64>,
 }
 
-/// Built-in names with the alignment of tensors.
-const BUILT_IN: [(&str, u32); 6] =
-    [("portable", 4), ("x86", 64), ("cortex-m4", 4), ("cortex-m7", 4), ("cortex-m55", 4), ("cortex-a", 16)];
+/// Built-in names with the alignment of tensors and the kernels.
+const BUILT_IN: [(&str, u32, &[KernelId]); 6] = [
+    ("portable", 4, &[KernelId::Direct]),
+    ("x86", 64, &[KernelId::K4N16, KernelId::Direct]),
+    ("cortex-m4", 4, &[KernelId::Direct]),
+    ("cortex-m7", 4, &[KernelId::Direct]),
+    ("cortex-m55", 4, &[KernelId::Direct]),
+    ("cortex-a", 16, &[KernelId::Direct]),
+];
+
+/// Kernels as descriptions name them.
+const KERNELS: [(&str, KernelId); 2] = [("direct", KernelId::Direct), ("k4n16", KernelId::K4N16)];
 
 /// Buffers listed in a message at most.
 const MAX_LISTED: usize = 12;
@@ -58,13 +68,13 @@ impl Target {
     /// # Errors
     /// Unknown name, unreadable file, or a file that is no target.
     pub fn find(name: &str) -> Result<Self> {
-        if let Some(&(name, alignment)) = BUILT_IN.iter().find(|(known, _)| *known == name) {
+        if let Some(&(name, alignment, kernels)) = BUILT_IN.iter().find(|built_in| built_in.0 == name) {
             return Ok(Self {
                 name: name.into(),
                 regions: vec![Region { name: "main".into(), bytes: None }],
                 flash_bytes: None,
                 alignment,
-                kernels: vec![KernelId::Direct],
+                kernels: kernels.to_vec(),
             });
         }
         if Path::new(name).extension().is_none_or(|e| e != "toml") {
@@ -119,6 +129,13 @@ impl Target {
         self
     }
 
+    /// The kernel of a weighted step with so many channel groups and output channels: the first that suits it, else the
+    /// first of all. `None` where the target lists none.
+    pub fn kernel_for(&self, groups: u16, outputs: u16) -> Option<KernelId> {
+        let suited = self.kernels.iter().find(|kernel| plan::suits(**kernel, groups, outputs));
+        suited.or(self.kernels.first()).copied()
+    }
+
     /// RAM for the arena; `None`: unlimited.
     pub fn ram_bytes(&self) -> Option<u64> {
         self.regions.first().and_then(|r| r.bytes)
@@ -166,10 +183,11 @@ pub fn parse_size(text: &str) -> Result<u64> {
 }
 
 fn kernel(name: &str) -> Result<KernelId> {
-    match name {
-        "direct" => Ok(KernelId::Direct),
-        _ => Err(Error::new(ErrorCode::Malformed, "kernels", format!("found '{name}', expected 'direct'"))),
-    }
+    let known = KERNELS.iter().find(|(known, _)| *known == name);
+    known.map(|(_, kernel)| *kernel).ok_or_else(|| {
+        let names = KERNELS.map(|(name, _)| format!("'{name}'")).join(" or ");
+        Error::new(ErrorCode::Malformed, "kernels", format!("found '{name}', expected {names}"))
+    })
 }
 
 fn help(plan: &MemoryPlan) -> String {
@@ -260,7 +278,7 @@ mod tests {
 
     #[test]
     fn built_in_targets_are_unlimited_until_limits_are_set() {
-        for (name, alignment) in BUILT_IN {
+        for (name, alignment, _) in BUILT_IN {
             let target = Target::find(name).unwrap();
             assert_eq!((target.alignment, target.ram_bytes(), target.flash_bytes), (alignment, None, None), "{name}");
             let small = target.with_limits(Some(1), Some(2));
@@ -280,6 +298,16 @@ mod tests {
         let kernels = vec![KernelId::Direct];
         let expected = Target { name: "b".into(), regions, flash_bytes: Some(2 << 20), alignment: 16, kernels };
         assert_eq!(target, expected);
+    }
+
+    #[test]
+    fn the_first_kernel_that_suits_a_step_is_chosen() {
+        let x86 = Target::find("x86").unwrap();
+        assert_eq!(x86.kernel_for(1, 64), Some(KernelId::K4N16));
+        assert_eq!(x86.kernel_for(64, 64), Some(KernelId::Direct), "depthwise");
+        let only = Target::parse(&BOARD.replace("flash = '2M'", "kernels = ['k4n16']")).unwrap();
+        assert_eq!(only.kernel_for(64, 64), Some(KernelId::K4N16));
+        assert_eq!(Target { kernels: vec![], ..only }.kernel_for(1, 1), None);
     }
 
     #[test]

@@ -48,6 +48,7 @@ pub fn frames((height, width): (u16, u16)) -> Vec<Frame> {
                 goal: Some(frame.target.map(f64::from)),
                 command: Some(frame.command as u8),
                 dropped_points: 0,
+                label: None,
             }
         })
         .collect()
@@ -73,7 +74,15 @@ pub fn quantized(graph: &Graph, options: &QuantizeOptions) -> QModel {
 /// # Panics
 /// The compiler refuses it.
 pub fn compiled(model: &QModel) -> Compiled {
-    let target = Target::find("portable").unwrap_or_else(|e| panic!("{e}"));
+    compiled_for(model, "portable")
+}
+
+/// Compiles a quantized model for a built-in target.
+///
+/// # Panics
+/// The compiler refuses it.
+pub fn compiled_for(model: &QModel, target: &str) -> Compiled {
+    let target = Target::find(target).unwrap_or_else(|e| panic!("{e}"));
     let options = PlanOptions::for_target(&target);
     pipeline::compile(model, &target, &options, &mut |_, _, _| {}).unwrap_or_else(|e| panic!("{e}"))
 }

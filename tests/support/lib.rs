@@ -6,6 +6,8 @@ pub mod commands;
 pub mod every_step;
 pub mod golden;
 pub mod mutation;
+pub mod onnx_file;
+pub mod onnxruntime;
 pub mod project;
 pub mod random;
 pub mod sketch;

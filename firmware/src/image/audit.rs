@@ -5,10 +5,12 @@
 //!   channel `|b'| + 383·Σ|w|` (8-bit input; some backends shift codes by 128) or `|b'| + 32768·Σ|w|` (16-bit), plus the
 //!   half of the first rounding.
 //! * Multipliers, shifts and table entries have the values that the arithmetic was proved for.
+//! * Packed weights say the same to every kernel: compensations fit them, and what fills them up is zero.
 
 use super::{Image, TensorRecord};
-use crate::program::{ConstRange, Rescale, Residual, Step};
-use crate::tensor::{ElementType, TensorId};
+use crate::kernels::k4n16::{COMPENSATION_FACTOR, Packed};
+use crate::program::{ConstRange, Conv2d, KernelId, Linear, Rescale, Residual, Step};
+use crate::tensor::{ElementType, TensorId, index};
 use core::fmt;
 use core::ops::RangeInclusive;
 
@@ -75,6 +77,8 @@ pub enum Array {
     Offsets,
     ExpTable,
     TanhTable,
+    WeightPadding,
+    Compensations,
 }
 
 impl fmt::Display for AuditError {
@@ -131,6 +135,18 @@ fn takes_over(a: &TensorRecord, b_id: u16, b: &TensorRecord) -> bool {
     a.in_place_of == Some(TensorId(b_id)) && a.first_step == b.last_step
 }
 
+/// Packed weights of a step under audit.
+struct Weights<'a> {
+    kernel: KernelId,
+    codes: &'a [i8],
+    /// Per group.
+    outputs: u16,
+    depth: usize,
+    /// Largest magnitude of an input code, in any backend's form.
+    largest_code: u64,
+    wide: bool,
+}
+
 /// One step under audit.
 struct Auditor<'i, 'a> {
     image: &'i Image<'a>,
@@ -140,8 +156,8 @@ struct Auditor<'i, 'a> {
 impl<'a> Auditor<'_, 'a> {
     fn step(&self, step: &Step, result: &mut Audit) -> Result<(), AuditError> {
         match step {
-            Step::Conv2d(step) => self.weighted(step.input, step.weights, &step.rescale, false, result),
-            Step::Linear(step) => self.weighted(step.input, step.weights, &step.rescale, step.wide, result),
+            Step::Conv2d(step) => self.weighted(&self.conv2d(step)?, &step.rescale, result),
+            Step::Linear(step) => self.weighted(&self.linear(step)?, &step.rescale, result),
             Step::ResizeBilinear(step) => {
                 let input = self.record(step.input.tensor)?.shape;
                 let weight = 1_u16.checked_shl(step.weight_bits.into()).unwrap_or_default();
@@ -153,6 +169,7 @@ impl<'a> Auditor<'_, 'a> {
                 self.within::<i64>(Array::Offsets, step.offsets, -(1 << 51)..=1 << 51)
             }
             Step::Attention(step) => self.within::<i16>(Array::ExpTable, step.exp_table, 0..=i16::MAX.into()),
+            Step::Softmax(step) => self.within::<i16>(Array::ExpTable, step.exp_table, 0..=i16::MAX.into()),
             Step::WaypointDecoder(step) => {
                 self.within::<u8>(Array::Shifts, step.shifts, 0..=30)?;
                 self.within::<i16>(Array::TanhTable, step.tanh_table, 0..=i16::MAX.into())
@@ -161,28 +178,42 @@ impl<'a> Auditor<'_, 'a> {
         }
     }
 
+    fn conv2d(&self, step: &Conv2d) -> Result<Weights<'a>, AuditError> {
+        let (input, output) = (self.record(step.input)?.shape, self.record(step.output)?.shape);
+        let taps = usize::from(step.window.kernel_h).saturating_mul(step.window.kernel_w.into());
+        let of_group = |channels: u16| channels.checked_div(step.groups).unwrap_or_default();
+        Ok(Weights {
+            kernel: step.kernel,
+            codes: self.read(step.weights)?,
+            outputs: of_group(output.channels),
+            depth: taps.saturating_mul(of_group(input.channels).into()),
+            largest_code: 383,
+            wide: false,
+        })
+    }
+
+    fn linear(&self, step: &Linear) -> Result<Weights<'a>, AuditError> {
+        let input = self.record(step.input)?;
+        Ok(Weights {
+            kernel: step.kernel,
+            codes: self.read(step.weights)?,
+            outputs: self.record(step.output)?.shape.channels,
+            depth: input.shape.channels.into(),
+            largest_code: if input.element == ElementType::I16 { 32768 } else { 383 },
+            wide: step.wide,
+        })
+    }
+
     /// Accumulator bounds, weights and epilogue of a weighted step.
-    fn weighted(
-        &self,
-        input: TensorId,
-        weights: ConstRange,
-        rescale: &Rescale,
-        wide: bool,
-        result: &mut Audit,
-    ) -> Result<(), AuditError> {
-        let largest_code = if self.record(input)?.element == ElementType::I16 { 32768 } else { 383 };
-        self.within::<i8>(Array::Weights, weights, -127..=127)?;
+    fn weighted(&self, weights: &Weights<'_>, rescale: &Rescale, result: &mut Audit) -> Result<(), AuditError> {
         self.epilogue(rescale)?;
-        let weights: &[i8] = self.read(weights)?;
         let bias: &[i32] = self.read(rescale.bias)?;
-        let depth = weights.len().checked_div(bias.len()).unwrap_or_default();
         let half = 1_u64.checked_shl(rescale.pre_shift.into()).unwrap_or_default() >> 1;
-        for ((channel, bias), weights) in (0_u32..).zip(bias).zip(weights.chunks(depth.max(1))) {
-            let sum = weights.iter().fold(0_u64, |sum, weight| sum.saturating_add(weight.unsigned_abs().into()));
-            let products = sum.saturating_mul(largest_code);
+        for (channel, bias) in (0_u32..).zip(bias) {
+            let products = self.magnitude(weights, channel)?.saturating_mul(weights.largest_code);
             let bound = products.saturating_add(bias.unsigned_abs().into()).saturating_add(half);
             result.channels = result.channels.saturating_add(1);
-            if wide {
+            if weights.wide {
                 continue;
             }
             if bound > u64::from(i32::MAX.unsigned_abs()) {
@@ -191,6 +222,51 @@ impl<'a> Auditor<'_, 'a> {
             result.accumulator_bits = result.accumulator_bits.max(u64::BITS.saturating_sub(bound.leading_zeros()));
         }
         Ok(())
+    }
+
+    /// `Σ|w|` of an output channel.
+    fn magnitude(&self, weights: &Weights<'_>, channel: u32) -> Result<u64, AuditError> {
+        let start = u64::from(channel).saturating_mul(weights.depth as u64);
+        let refuse = |array, k: usize, found: i64| {
+            let element = u32::try_from(start.saturating_add(k as u64)).unwrap_or(u32::MAX);
+            AuditError::Constant { step: self.position, array, element, found }
+        };
+        let (mut sum, mut magnitude) = (0_i64, 0_u64);
+        let mut add = |(k, weight): (usize, i8)| {
+            if weight == i8::MIN {
+                return Err(refuse(Array::Weights, k, weight.into()));
+            }
+            if k >= weights.depth && weight != 0 {
+                return Err(refuse(Array::WeightPadding, k, weight.into()));
+            }
+            sum = sum.saturating_add(weight.into());
+            magnitude = magnitude.saturating_add(weight.unsigned_abs().into());
+            Ok(())
+        };
+        let unreadable = AuditError::Unreadable { step: self.position };
+        let row = index(channel);
+        match weights.kernel {
+            KernelId::Direct => {
+                let first = row.saturating_mul(weights.depth);
+                let codes = weights.codes.get(first..first.saturating_add(weights.depth)).ok_or(unreadable)?;
+                codes.iter().copied().enumerate().try_for_each(&mut add)?;
+            }
+            KernelId::K4N16 => {
+                let packed = Packed::new(weights.codes, weights.outputs, weights.depth);
+                let (codes, compensation) = packed.padded(row).zip(packed.compensation(row)).ok_or(unreadable)?;
+                codes.enumerate().try_for_each(&mut add)?;
+                if i64::from(compensation) != sum.saturating_mul(COMPENSATION_FACTOR.into()) {
+                    let found = compensation.into();
+                    return Err(AuditError::Constant {
+                        step: self.position,
+                        array: Array::Compensations,
+                        element: channel,
+                        found,
+                    });
+                }
+            }
+        }
+        Ok(magnitude)
     }
 
     fn epilogue(&self, rescale: &Rescale) -> Result<(), AuditError> {

@@ -1,5 +1,7 @@
-//! What the kernels need, as pure functions shared with the compiler: scratch sizes and in-place rules.
+//! What the kernels need, as pure functions shared with the compiler: choice of kernels, sizes of packed weights and
+//! scratch, in-place rules.
 
+use super::k4n16;
 use super::portable::Axis;
 use crate::program::{KernelId, Window};
 use crate::tensor::{ElementType, Shape};
@@ -7,26 +9,69 @@ use crate::tensor::{ElementType, Shape};
 /// Rows (output pixels, positions) that the portable product works on at once.
 pub const TILE_ROWS: u32 = 4;
 
-/// Scratch of a convolution, bytes: the windows of up to [`TILE_ROWS`] output pixels in one group, widened to `i16`.
+/// Rows that the kernels of [`KernelId::K4N16`] work on at once.
+pub const PACKED_TILE_ROWS: u32 = 6;
+
+/// Most scratch that a step of [`KernelId::K4N16`] asks for, unless a single tile needs more: it and the weights that
+/// meet it stay in a second-level cache of 1 MiB.
+const PACKED_SCRATCH_BYTES: u64 = 384 << 10;
+
+/// Whether a weighted step gains by a kernel: blocks of 16 outputs want groups that fill them. (Every kernel can run
+/// every step.)
+pub const fn suits(kernel: KernelId, groups: u16, outputs: u16) -> bool {
+    match kernel {
+        KernelId::Direct => true,
+        KernelId::K4N16 => groups == 1 || (groups != 0 && ((outputs / groups) as usize).is_multiple_of(k4n16::OUTPUTS)),
+    }
+}
+
+/// Bytes of packed weights: `groups` groups of `outputs` outputs with `depth` weights each.
+pub const fn weight_bytes(kernel: KernelId, groups: u16, outputs: u16, depth: u64) -> u64 {
+    match kernel {
+        KernelId::Direct => (groups as u64 * outputs as u64).saturating_mul(depth),
+        KernelId::K4N16 => k4n16::packed_bytes(groups, outputs, depth),
+    }
+}
+
+/// Scratch of a convolution, bytes. [`KernelId::Direct`]: the windows of up to [`TILE_ROWS`] output pixels in one group,
+/// widened to `i16`. [`KernelId::K4N16`]: the same for as many tiles as fit the cache.
 pub const fn conv2d_scratch_bytes(kernel: KernelId, input: Shape, output: Shape, window: Window, groups: u16) -> u32 {
-    let KernelId::Direct = kernel;
     if groups == 0 {
         return 0;
     }
     let depth = window.kernel_h as u64 * window.kernel_w as u64 * (input.channels / groups) as u64;
     let positions = output.positions();
-    let rows = if positions < TILE_ROWS { positions } else { TILE_ROWS };
-    saturate(2 * rows as u64 * depth)
+    match kernel {
+        KernelId::Direct => {
+            let rows = if positions < TILE_ROWS { positions } else { TILE_ROWS };
+            saturate(2 * rows as u64 * depth)
+        }
+        KernelId::K4N16 => packed_scratch_bytes(depth, positions),
+    }
 }
 
-/// Scratch of a linear layer, bytes: [`TILE_ROWS`] rows of an `i8` input, widened to `i16`; none for `i16` input.
-pub const fn linear_scratch_bytes(kernel: KernelId, inputs: u16, outputs: u16, input: ElementType) -> u32 {
-    let KernelId::Direct = kernel;
-    let _ = outputs;
-    match input {
-        ElementType::I8 => 2 * TILE_ROWS * inputs as u32,
-        ElementType::I16 | ElementType::I32 | ElementType::Scratch => 0,
+/// Scratch of a linear layer, bytes. [`KernelId::Direct`]: [`TILE_ROWS`] rows of an `i8` input, widened to `i16`; none for
+/// `i16` input. [`KernelId::K4N16`]: as for a convolution.
+pub const fn linear_scratch_bytes(kernel: KernelId, positions: u32, inputs: u16, input: ElementType) -> u32 {
+    match (kernel, input) {
+        (KernelId::Direct, ElementType::I8) => 2 * TILE_ROWS * inputs as u32,
+        (KernelId::Direct, ElementType::I16 | ElementType::I32 | ElementType::Scratch) => 0,
+        (KernelId::K4N16, _) => packed_scratch_bytes(inputs as u64, positions),
     }
+}
+
+/// Bytes from one row of `length` bytes in scratch to the next: an odd number of cache lines, so that the rows of a tile
+/// never compete for the same set of a cache.
+pub const fn row_stride_bytes(length: u64) -> u64 {
+    (length.div_ceil(64) | 1).saturating_mul(64)
+}
+
+/// Tiles of `i16` rows; a tile also has room for the portable kernel's rows and the weights of one output.
+const fn packed_scratch_bytes(depth: u64, positions: u32) -> u32 {
+    let tile = (PACKED_TILE_ROWS as u64).saturating_mul(row_stride_bytes(depth.saturating_mul(2)));
+    let (wanted, fitting) = (positions.div_ceil(PACKED_TILE_ROWS) as u64, PACKED_SCRATCH_BYTES / tile);
+    let tiles = if wanted < fitting { wanted } else { fitting };
+    saturate(tile.saturating_mul(if tiles == 0 { 1 } else { tiles }))
 }
 
 /// Scratch of attention, bytes: for one query row of one head the logits (`i32`, one per key), the context sums
@@ -143,6 +188,28 @@ mod tests {
     }
 
     #[test]
+    fn blocks_want_groups_that_fill_them() {
+        assert!(suits(KernelId::K4N16, 1, 3) && suits(KernelId::K4N16, 2, 64));
+        assert!(!suits(KernelId::K4N16, 2, 48) && !suits(KernelId::K4N16, 64, 64) && !suits(KernelId::K4N16, 0, 64));
+        assert!(suits(KernelId::Direct, 64, 64));
+        assert_eq!(weight_bytes(KernelId::Direct, 2, 8, 9), 144);
+        assert_eq!(weight_bytes(KernelId::K4N16, 2, 17, 9), 4 * (64 + 16 * 64));
+    }
+
+    #[test]
+    fn packed_scratch_holds_whole_tiles_within_the_cache() {
+        let three = Window::square(3, 1, 1);
+        let scratch = |side, channels| {
+            let shape = Shape::map(side, side, channels);
+            conv2d_scratch_bytes(KernelId::K4N16, shape, shape, three, 1)
+        };
+        assert_eq!(scratch(2, 64), 6 * 19 * 64, "four pixels are one tile");
+        let tile = 6 * 145 * 64;
+        assert_eq!(scratch(8, 512), 7 * tile);
+        assert!(scratch(64, 64) <= 384 << 10);
+    }
+
+    #[test]
     fn scratch_of_hostile_shapes_is_a_number() {
         let all = Shape::map(u16::MAX, u16::MAX, u16::MAX);
         let window = Window {
@@ -161,7 +228,10 @@ mod tests {
         assert_eq!(conv2d_scratch_bytes(KernelId::Direct, all, all, window, 0), 0);
         assert_eq!(attention_scratch_bytes(u32::MAX, u16::MAX, 1), u32::MAX);
         assert_eq!(attention_scratch_bytes(1, 1, 0), 0);
-        assert_eq!(linear_scratch_bytes(KernelId::Direct, u16::MAX, 1, ElementType::I8), 8 * 65535);
+        assert_eq!(linear_scratch_bytes(KernelId::Direct, 1, u16::MAX, ElementType::I8), 8 * 65535);
+        assert_eq!(conv2d_scratch_bytes(KernelId::K4N16, all, all, window, 1), u32::MAX);
+        assert_eq!(linear_scratch_bytes(KernelId::K4N16, u32::MAX, u16::MAX, ElementType::I16), 6 * 64 * 2049);
+        assert_eq!(linear_scratch_bytes(KernelId::K4N16, 0, 0, ElementType::I8), 6 * 64);
         assert_eq!(waypoint_decoder_scratch_bytes(u16::MAX), 4 * 65535);
         assert!(!max_pool_in_place(all, all, Window { stride_h: 0, ..window }));
     }

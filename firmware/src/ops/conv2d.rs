@@ -4,7 +4,7 @@ use super::{StepContext, rescale};
 use crate::arena::{Changed, Operands};
 use crate::image::{Check, ParseError};
 use crate::kernels::{Conv2dArgs, Kernels, plan};
-use crate::program::{Conv2d, KernelId};
+use crate::program::Conv2d;
 use crate::tensor::ElementType;
 
 pub(super) fn validate(step: &Conv2d, context: &StepContext<'_, '_>) -> Result<u64, ParseError> {
@@ -16,9 +16,8 @@ pub(super) fn validate(step: &Conv2d, context: &StepContext<'_, '_>) -> Result<u
     context.ensure(Check::StepGroups, divides(input.channels) && divides(output.channels), step.groups, 1)?;
     let taps = u64::from(step.window.kernel_h).saturating_mul(step.window.kernel_w.into());
     let depth = taps.saturating_mul(input.channels.checked_div(step.groups).unwrap_or_default().into());
-    let weights = match step.kernel {
-        KernelId::Direct => depth.saturating_mul(output.channels.into()),
-    };
+    let outputs_per_group = output.channels.checked_div(step.groups).unwrap_or_default();
+    let weights = plan::weight_bytes(step.kernel, step.groups, outputs_per_group, depth);
     context.constants::<i8>(step.weights, weights)?;
     context.constants::<i8>(step.padding_codes, input.channels.into())?;
     rescale::validate(&step.rescale, step.output, context)?;

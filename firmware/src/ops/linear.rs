@@ -4,18 +4,16 @@ use super::{StepContext, rescale};
 use crate::arena::{Changed, Operands};
 use crate::image::{Check, ParseError};
 use crate::kernels::{Kernels, LinearArgs, plan};
-use crate::program::{KernelId, Linear};
+use crate::program::Linear;
 
 pub(super) fn validate(step: &Linear, context: &StepContext<'_, '_>) -> Result<u64, ParseError> {
     let record = context.activation(step.input)?;
     let (input, output) = (record.shape, context.activation(step.output)?.shape);
     context.ensure_equal(Check::StepShape, output.positions(), input.positions())?;
-    let weights = match step.kernel {
-        KernelId::Direct => u64::from(input.channels).saturating_mul(output.channels.into()),
-    };
+    let weights = plan::weight_bytes(step.kernel, 1, output.channels, input.channels.into());
     context.constants::<i8>(step.weights, weights)?;
     rescale::validate(&step.rescale, step.output, context)?;
-    let scratch = plan::linear_scratch_bytes(step.kernel, input.channels, output.channels, record.element);
+    let scratch = plan::linear_scratch_bytes(step.kernel, input.positions(), input.channels, record.element);
     context.scratch(step.scratch, scratch)?;
     Ok(output.elements().saturating_mul(input.channels.into()))
 }

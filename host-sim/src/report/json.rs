@@ -2,6 +2,7 @@
 
 use super::VerifyReport;
 use crate::ablation::Row;
+use crate::bench::figures::BenchReport;
 use crate::diff::Diff;
 use crate::gates::GateOutcome;
 use crate::run::RunReport;
@@ -85,6 +86,11 @@ pub fn ablation(rows: &[Row]) -> Value {
     json!({"schema": 1, "variants": to_value(&rows)})
 }
 
+/// Document of a measurement.
+pub fn bench(report: &BenchReport) -> Value {
+    to_value(report)
+}
+
 /// Why a command failed.
 #[derive(Debug, Serialize, JsonSchema)]
 pub struct Failure {
@@ -124,20 +130,44 @@ fn to_value(report: &impl Serialize) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::{FrameResult, ModelInfo};
+    use crate::classification::Classification;
+    use crate::run::{FrameResult, ModelInfo, Output};
     use model_compiler::error::ErrorCode;
+    use model_compiler::frames::{Frame, Label};
 
     #[test]
     fn run_has_the_documented_shape() {
         let model = ModelInfo { name: "mini".into(), sha256: "00".into() };
-        let frames = vec![FrameResult { name: "a".into(), waypoints: vec![[0.5, 2.0]] }];
-        let document = run(&RunReport { schema: 1, model, frames });
+        let output = Output::Waypoints { waypoints: vec![[0.5, 2.0]] };
+        let document = run(&RunReport::new(model, vec![FrameResult { name: "a".into(), output }]));
         let expected = json!({
             "schema": 1,
             "model": {"name": "mini", "sha256": "00"},
             "frames": [{"name": "a", "waypoints": [[0.5, 2.0]]}],
         });
         assert_eq!(document, expected);
+    }
+
+    #[test]
+    fn run_of_a_classifier_has_logits_classes_and_accuracy() {
+        let model = || ModelInfo { name: "mini".into(), sha256: "00".into() };
+        let result = |label: Option<u16>| {
+            let label = label.map(|class| Label { class, name: "cat".into() });
+            let frame = Frame { name: "a".into(), label, ..Frame::default() };
+            FrameResult { name: "a".into(), output: Output::Class(Classification::new(vec![0.5, -2.0], &frame)) }
+        };
+        let document = run(&RunReport::new(model(), vec![result(Some(0)), result(None)]));
+        let interval = document["accuracy"]["interval"].clone();
+        let expected = json!({
+            "schema": 1,
+            "model": {"name": "mini", "sha256": "00"},
+            "frames": [{"name": "a", "logits": [0.5, -2.0], "top1": 0, "label": 0},
+                       {"name": "a", "logits": [0.5, -2.0], "top1": 0}],
+            "accuracy": {"top1": 1.0, "interval": interval, "frames": 1},
+        });
+        assert_eq!(document, expected);
+        assert_eq!(document["accuracy"]["interval"][1], 1.0);
+        assert!(run(&RunReport::new(model(), vec![result(None)])).get("accuracy").is_none());
     }
 
     #[test]

@@ -1,29 +1,42 @@
 //! The forms for people: tables with a line per frame or step, and a short summary.
 
 use super::figures::{figure, signed};
-use super::{FrameReport, StepReport, VerifyReport};
+use super::{FrameReport, StepReport, VerifyReport, classes};
 use crate::ablation::Row;
 use crate::diff::{Diff, FigureChange, MENTIONED_DB, StepChange};
 use crate::gates::GateOutcome;
-use crate::run::{FrameResult, ModelInfo, RunReport, Waypoints};
+use crate::run::{FrameResult, ModelInfo, Output, RunReport, Waypoints};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
+
+mod bench;
+
+pub use bench::bench;
 
 /// Changed steps that a terminal shows.
 const MAX_CHANGES: usize = 20;
 
-/// Waypoints of every frame.
+/// Waypoints or classes of every frame.
 pub fn run(report: &RunReport) -> String {
-    let longest = report.frames.iter().map(|frame| frame.waypoints.len()).max().unwrap_or(0);
+    let head = format!("{} (sha256 {}…)", report.model.name, &report.model.sha256[..16]);
+    let waypoints = |frame: &FrameResult| match &frame.output {
+        Output::Waypoints { waypoints } => Some((frame.name.clone(), waypoints.clone())),
+        Output::Class(_) => None,
+    };
+    let driven: Vec<(String, Waypoints)> = report.frames.iter().filter_map(waypoints).collect();
+    if driven.is_empty() {
+        return format!("{head}\n\n{}", classes::run(report));
+    }
+    let longest = driven.iter().map(|(_, waypoints)| waypoints.len()).max().unwrap_or(0);
     let header = ["frame".to_owned()]
         .into_iter()
         .chain((1..=longest).flat_map(|k| [format!("right {k}"), format!("forward {k}")]));
-    let row = |frame: &FrameResult| {
-        let meters = frame.waypoints.iter().flatten().map(|meters| format!("{meters:.3}"));
-        [frame.name.clone()].into_iter().chain(meters).collect()
+    let row = |(name, waypoints): &(String, Waypoints)| {
+        let meters = waypoints.iter().flatten().map(|meters| format!("{meters:.3}"));
+        [name.clone()].into_iter().chain(meters).collect()
     };
-    let table = table(header.collect(), &[0], report.frames.iter().map(row));
-    format!("{} (sha256 {}…), waypoints in meters\n\n{table}\n", report.model.name, &report.model.sha256[..16])
+    let table = table(header.collect(), &[0], driven.iter().map(row));
+    format!("{head}, waypoints in meters\n\n{table}\n")
 }
 
 /// The steps and the summary of a verification.
@@ -61,6 +74,9 @@ pub fn waypoints(frames: &[FrameReport]) -> String {
 
 /// One line per variant of the quantizer.
 pub fn ablation(rows: &[Row]) -> String {
+    if rows.iter().any(|row| row.fidelity.classes.is_some()) {
+        return classes::ablation(rows);
+    }
     let waypoints = rows.first().map_or(0, |row| row.fidelity.mean_mm.len());
     let numbered = |what: &str| (1..=waypoints).map(|k| format!("{what} mm {k}")).collect::<Vec<_>>();
     let header = [vec!["variant".to_owned(), "vector dB".to_owned()], numbered("mean"), numbered("worst")].concat();
@@ -112,6 +128,7 @@ pub fn summary(report: &VerifyReport) -> String {
             error.max
         );
     }
+    text += &s.accuracy.as_ref().map(classes::verify).unwrap_or_default();
     let _ = writeln!(
         text,
         "arena                  {} B, lower bound {} B: {}",
@@ -174,7 +191,7 @@ pub fn gates(gates: &[GateOutcome]) -> String {
 }
 
 /// A table whose columns are aligned right, except those of words.
-fn table(header: Vec<String>, words: &[usize], rows: impl Iterator<Item = Vec<String>>) -> String {
+pub(super) fn table(header: Vec<String>, words: &[usize], rows: impl Iterator<Item = Vec<String>>) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
     table.set_header(header);
@@ -192,8 +209,11 @@ mod tests {
     #[test]
     fn waypoints_stand_in_columns() {
         let model = ModelInfo { name: "mini".into(), sha256: "ab".repeat(32) };
-        let frame = |name: &str, x: f64| FrameResult { name: name.into(), waypoints: vec![[x, 2.0], [-x, 14.25]] };
-        let text = run(&RunReport { schema: 1, model, frames: vec![frame("a", 0.5), frame("long name", -10.0)] });
+        let frame = |name: &str, x: f64| {
+            let waypoints = vec![[x, 2.0], [-x, 14.25]];
+            FrameResult { name: name.into(), output: Output::Waypoints { waypoints } }
+        };
+        let text = run(&RunReport::new(model, vec![frame("a", 0.5), frame("long name", -10.0)]));
         let lines: Vec<&str> = text.lines().skip(2).collect();
         assert_eq!(
             lines[0].split_whitespace().collect::<Vec<_>>().join(" "),

@@ -4,7 +4,6 @@ use super::in_place::overwritable;
 use super::needs::{scratch_bytes, scratch_room, tensor_bytes};
 use super::{MemoryPlan, Placement, PlanStatus, SCRATCH_ALIGNMENT};
 use crate::qmodel::{QModel, QTensorId};
-use firmware::program::KernelId;
 
 /// Verifies that a plan computes what the model computes: the order runs; live ranges, sizes and scratch are right; every
 /// in-place pair is legal; no two buffers that are live together overlap; everything is aligned and inside the arena; the
@@ -45,13 +44,12 @@ struct Live<'a> {
 impl<'a> Checker<'a> {
     fn lengths_and_order(&mut self) {
         let (model, plan) = (self.model, self.plan);
-        if plan.tensors.len() != model.tensors.len() || plan.scratch.len() != model.steps.len() {
+        let (tensors, steps) = (model.tensors.len(), model.steps.len());
+        let found = (plan.tensors.len(), plan.scratch.len(), plan.kernels.len());
+        if found != (tensors, steps, steps) {
+            let (found_tensors, scratch, kernels) = found;
             self.problems.push(format!(
-                "{} tensors and {} scratch entries, expected {} and {}",
-                plan.tensors.len(),
-                plan.scratch.len(),
-                model.tensors.len(),
-                model.steps.len()
+                "{found_tensors} tensors, {scratch} scratch entries and {kernels} kernels, expected {tensors} and {steps}"
             ));
         }
         let mut sorted = plan.order.clone();
@@ -98,7 +96,7 @@ impl<'a> Checker<'a> {
         }
         for position in 0..self.plan.order.len() as u32 {
             let step = self.step(position);
-            let expected = scratch_bytes(self.model, &step.op, KernelId::Direct);
+            let expected = scratch_bytes(self.model, &step.op, self.plan.kernels[position as usize]);
             let name = format!("scratch of {}", step.name);
             match &self.plan.scratch[position as usize] {
                 None if expected == 0 => {}

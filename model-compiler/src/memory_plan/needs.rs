@@ -25,6 +25,8 @@ pub(crate) struct Needs {
     pub writes: Vec<usize>,
     /// Per step the operands that its output may overwrite if they die there.
     pub overwritable: Vec<Vec<usize>>,
+    /// Kernel per step, where it is weighted.
+    pub kernels: Vec<Option<KernelId>>,
     /// Exact scratch bytes per step.
     pub scratch: Vec<u64>,
     /// Of tensors, bytes.
@@ -34,9 +36,9 @@ pub(crate) struct Needs {
 impl Needs {
     /// Collects the needs and checks that the steps run in the model's order.
     pub fn of(model: &QModel, target: &Target, options: &PlanOptions) -> Result<Self> {
-        let Some(&kernel) = target.kernels.first() else {
+        if target.kernels.is_empty() {
             return Err(Error::new(ErrorCode::Usage, format!("target {}", target.name), "no kernels are listed"));
-        };
+        }
         check_dataflow(model)?;
         let alignment = u64::from(options.alignment);
         let exact_bytes: Vec<u64> =
@@ -56,6 +58,9 @@ impl Needs {
             let found = overwritable(model, op, options.in_place_pooling, options.in_place);
             found.into_iter().map(|t| t.0 as usize).collect()
         };
+        let kernels: Vec<_> = model.steps.iter().map(|s| kernel(model, target, &s.op)).collect();
+        let scratch =
+            model.steps.iter().zip(&kernels).map(|(s, kernel)| scratch_bytes(model, &s.op, *kernel)).collect();
         Ok(Self {
             tensor_bytes: exact_bytes.iter().map(|b| b.next_multiple_of(alignment)).collect(),
             exact_bytes,
@@ -64,7 +69,8 @@ impl Needs {
             reads: model.steps.iter().map(|s| indices(s.op.reads())).collect(),
             writes: model.steps.iter().map(|s| s.op.output().0 as usize).collect(),
             overwritable: model.steps.iter().map(|s| operands(&s.op)).collect(),
-            scratch: model.steps.iter().map(|s| scratch_bytes(model, &s.op, kernel)).collect(),
+            kernels,
+            scratch,
             alignment,
         })
     }
@@ -116,16 +122,26 @@ pub(super) fn scratch_room(bytes: u64, alignment: u64) -> u64 {
     if bytes == 0 { 0 } else { (bytes + SCRATCH_ALIGNMENT.saturating_sub(alignment)).next_multiple_of(alignment) }
 }
 
-/// Exact scratch of a step with a kernel.
-pub(super) fn scratch_bytes(model: &QModel, op: &QOp, kernel: KernelId) -> u64 {
+/// The target's kernel for a step, where it is weighted.
+fn kernel(model: &QModel, target: &Target, op: &QOp) -> Option<KernelId> {
+    match op {
+        QOp::Conv2d { output, groups, .. } => target.kernel_for(*groups, model.tensor(*output).shape.channels),
+        QOp::Linear { output, .. } => target.kernel_for(1, model.tensor(*output).shape.channels),
+        _ => None,
+    }
+}
+
+/// Exact scratch of a step with its kernel.
+pub(super) fn scratch_bytes(model: &QModel, op: &QOp, kernel: Option<KernelId>) -> u64 {
+    let kernel = kernel.unwrap_or(KernelId::Direct);
     let shape = |id: &QTensorId| model.tensor(*id).shape;
     u64::from(match op {
         QOp::Conv2d { input, output, window, groups, .. } => {
             plan::conv2d_scratch_bytes(kernel, shape(input), shape(output), *window, *groups)
         }
-        QOp::Linear { input, output, .. } => {
+        QOp::Linear { input, .. } => {
             let element = model.tensor(*input).element;
-            plan::linear_scratch_bytes(kernel, shape(input).channels, shape(output).channels, element)
+            plan::linear_scratch_bytes(kernel, shape(input).positions(), shape(input).channels, element)
         }
         QOp::Attention { query, heads, .. } => {
             plan::attention_scratch_bytes(shape(query).positions(), shape(query).channels, *heads)

@@ -90,6 +90,7 @@ pub fn rerun(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ir::Clip;
     use crate::ir::InputKind;
     use crate::reference::run_all;
 
@@ -97,10 +98,10 @@ mod tests {
     fn graph() -> (Graph, [ValueId; 3]) {
         let mut graph = Graph::default();
         let x = graph.push_input("x", InputKind::Goal, Shape::vector(2));
-        let a = graph.push("a", Op::Relu, &[x]).unwrap();
-        let b = graph.push("b", Op::Add { relu: false }, &[a, a]).unwrap();
-        let c = graph.push("c", Op::Add { relu: false }, &[a, b]).unwrap();
-        graph.push("unused", Op::Add { relu: false }, &[b, b]).unwrap();
+        let a = graph.push("a", Op::Clip(Clip::RELU), &[x]).unwrap();
+        let b = graph.push("b", Op::Add { clip: Clip::NONE }, &[a, a]).unwrap();
+        let c = graph.push("c", Op::Add { clip: Clip::NONE }, &[a, b]).unwrap();
+        graph.push("unused", Op::Add { clip: Clip::NONE }, &[b, b]).unwrap();
         graph.outputs = vec![c];
         (graph, [a, b, c])
     }

@@ -1,8 +1,8 @@
 //! Portable convolution: windows gathered into scratch, then the product of a tile of them with the weights.
 
-use super::axis::Axis;
-use super::codes::{Code, block, block_mut, take, widen};
-use super::product::{Product, TILE};
+use super::codes::{Code, block_mut, take, widen};
+use super::product::{Product, TILE, Weights};
+use super::windows::Windows;
 use crate::fault::{self, Fault};
 use crate::kernels::Conv2dArgs;
 use crate::tensor::{CodesMut, Shape, index};
@@ -10,7 +10,7 @@ use crate::tensor::{CodesMut, Shape, index};
 /// `acc = b' + Σ w·q` over each window, then the epilogue.
 ///
 /// `input`: i8 map `H×W×C`; `output`: i8 or i16 map `OH×OW×O`, which may hold the residual; weights
-/// `[O][kh][kw][C/groups]` in [−127, 127]; padding is the padding code of its input channel. Products are exact in i32
+/// `[O][kh][kw][C/groups]` in [−127, 127], packed; padding is the padding code of its input channel. Products are exact in i32
 /// under the compiler's bound. `scratch`: [`crate::kernels::plan::conv2d_scratch_bytes`], aligned to 2 bytes.
 pub fn conv2d(args: &Conv2dArgs<'_>, input: &[i8], output: CodesMut<'_>, scratch: &mut [u8]) {
     match output {
@@ -20,27 +20,29 @@ pub fn conv2d(args: &Conv2dArgs<'_>, input: &[i8], output: CodesMut<'_>, scratch
 }
 
 fn run<T: Code>(args: &Conv2dArgs<'_>, input: &[i8], output: &mut [T], mut scratch: &mut [u8]) {
-    let Some(source) = Source::new(args, input) else { return };
+    let Some(windows) = Windows::new(args, input) else { return };
     let (Some(outputs_per_group), Some(width)) = (
-        args.output_shape.channels.checked_div(args.groups).map(usize::from),
+        args.output_shape.channels.checked_div(args.groups),
         core::num::NonZeroUsize::new(usize::from(args.output_shape.width)),
     ) else {
         return;
     };
     let outputs = usize::from(args.output_shape.channels);
-    let depth = source.depth();
+    let depth = windows.depth();
     let positions = index(args.output_shape.positions());
+    let weights = Weights::new(args.kernel, args.weights, outputs_per_group, depth);
     let Some(tile) = take::<i16>(&mut scratch, TILE.min(positions).saturating_mul(depth)) else { return };
+    let Some(buffer) = weights.buffer(&mut scratch, depth) else { return };
     if depth == 0 || args.output_shape.elements() != output.len() as u64 {
         return;
     }
     let (end, step) = traversal(args.output_shape);
     for group in 0..usize::from(args.groups) {
-        let Some(weights) = block(args.weights, group, outputs_per_group.saturating_mul(depth)) else { return };
+        let first_channel = group * usize::from(outputs_per_group);
         let product = Product {
             weights,
             depth,
-            first_channel: group * outputs_per_group,
+            channels: first_channel..first_channel + usize::from(outputs_per_group),
             outputs,
             rescale: &args.rescale,
             wide: false,
@@ -52,10 +54,10 @@ fn run<T: Code>(args: &Conv2dArgs<'_>, input: &[i8], output: &mut [T], mut scrat
             let count = step.min(end - first);
             for i in 0..count {
                 if let Some(row) = block_mut(tile, i, depth) {
-                    source.gather(group, (first + i) / width, (first + i) % width, row);
+                    windows.gather(group, (first + i) / width, (first + i) % width, row, widen);
                 }
             }
-            product.tile(tile.get(..count * depth).unwrap_or_default(), first, output);
+            product.tile(tile.get(..count * depth).unwrap_or_default(), first, output, buffer);
         }
     }
 }
@@ -67,77 +69,10 @@ fn traversal(output: Shape) -> (usize, usize) {
     (index(output.positions()) - last_row, if fault::active(Fault::LastColumn) { 1 } else { TILE })
 }
 
-/// The input of a convolution as its windows see it.
-struct Source<'a> {
-    input: &'a [i8],
-    padding_codes: &'a [i8],
-    rows: Axis,
-    columns: Axis,
-    width: usize,
-    channels: usize,
-    group_channels: usize,
-}
-
-impl<'a> Source<'a> {
-    /// `None` where `input` is not of the input shape.
-    fn new(args: &Conv2dArgs<'a>, input: &'a [i8]) -> Option<Self> {
-        let shape = args.input_shape;
-        (shape.elements() == input.len() as u64).then_some(())?;
-        Some(Self {
-            input,
-            padding_codes: args.padding_codes,
-            rows: Axis::rows(&args.window, shape),
-            columns: Axis::columns(&args.window, shape),
-            width: usize::from(shape.width),
-            channels: usize::from(shape.channels),
-            group_channels: usize::from(shape.channels.checked_div(args.groups)?),
-        })
-    }
-
-    fn depth(&self) -> usize {
-        self.rows.kernel() * self.columns.kernel() * self.group_channels
-    }
-
-    /// Widens the window of output `(y, x)` in `group` into `row`, in the order of the weights.
-    fn gather(&self, group: usize, y: usize, x: usize, row: &mut [i16]) {
-        let line_len = self.columns.kernel() * self.group_channels;
-        if line_len == 0 {
-            return;
-        }
-        // Neighboring taps of all channels lie side by side in the input as they do in the window.
-        let solid = if self.channels == self.group_channels { self.columns.solid(x) } else { None };
-        for (ky, line) in row.chunks_exact_mut(line_len).enumerate() {
-            match (self.rows.tap(y, ky), solid) {
-                (Some(iy), Some(ix)) => {
-                    let start = (iy * self.width + ix) * self.channels;
-                    widen(self.input.get(start..).unwrap_or_default(), line);
-                }
-                (iy, _) => self.gather_line(group, iy, x, line),
-            }
-        }
-    }
-
-    /// One line of a window, tap by tap; `iy` is `None` above and below the input.
-    fn gather_line(&self, group: usize, iy: Option<usize>, x: usize, line: &mut [i16]) {
-        for (kx, tap) in line.chunks_exact_mut(self.group_channels.max(1)).enumerate() {
-            let pixel = iy.zip(self.columns.tap(x, kx)).map(|(iy, ix)| iy * self.width + ix);
-            let codes = match pixel {
-                Some(pixel) => block(self.input, pixel, self.channels),
-                None if fault::active(Fault::PaddingZeroPoint) => None,
-                None => Some(self.padding_codes),
-            };
-            match codes.and_then(|codes| block(codes, group, self.group_channels)) {
-                Some(codes) => widen(codes, tap),
-                None => tap.fill(0),
-            }
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     extern crate std;
-    use super::super::oracle::{Buffer, HOSTILE, RescaleConstants, Rng, Scratch, for_seeds, rescale};
+    use super::super::oracle::{Buffer, HOSTILE, RescaleConstants, Rng, Scratch, for_seeds, pack, rescale};
     use super::*;
     use crate::kernels::plan::conv2d_scratch_bytes;
     use crate::program::{KernelId, Window};
@@ -209,11 +144,14 @@ mod tests {
             rescale: constants.args(),
         };
         let expected = expected(&args, &input, &constants.residual_buffer);
-        let mut output = constants.initial_output(rng);
-        let mut scratch =
-            Scratch::new(conv2d_scratch_bytes(KernelId::Direct, input_shape, output_shape, window, groups));
-        conv2d(&args, &input, output.codes_mut(), scratch.bytes());
-        output.assert_equals(&expected, &std::format!("{input_shape:?} {window:?} groups {groups}"));
+        for kernel in KernelId::ALL {
+            let packed = pack(*kernel, &weights, groups, outputs / groups, depth);
+            let args = Conv2dArgs { kernel: *kernel, weights: &packed, ..args };
+            let mut output = constants.initial_output(rng);
+            let mut scratch = Scratch::new(conv2d_scratch_bytes(*kernel, input_shape, output_shape, window, groups));
+            conv2d(&args, &input, output.codes_mut(), scratch.bytes());
+            output.assert_equals(&expected, &std::format!("{kernel:?} {input_shape:?} {window:?} groups {groups}"));
+        }
     }
 
     #[test]

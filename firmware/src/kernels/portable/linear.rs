@@ -1,14 +1,14 @@
 //! Portable linear layer.
 
 use super::codes::{Code, take, widen};
-use super::product::{Product, TILE};
+use super::product::{Product, TILE, Weights};
 use crate::kernels::LinearArgs;
 use crate::tensor::{Codes, CodesMut, index};
 
 /// `acc = b' + Σ w·q` per position, then the epilogue.
 ///
 /// `input`: i8 or i16, `positions × inputs`; `output`: i8 or i16, `positions × outputs`, which may hold the residual;
-/// weights `[outputs][inputs]` in [−127, 127]. Accumulates in i32, with `wide` in i64. `scratch`:
+/// weights `[outputs][inputs]` in [−127, 127], packed. Accumulates in i32, with `wide` in i64. `scratch`:
 /// [`crate::kernels::plan::linear_scratch_bytes`], aligned to 2 bytes.
 pub fn linear(args: &LinearArgs<'_>, input: Codes<'_>, output: CodesMut<'_>, scratch: &mut [u8]) {
     match output {
@@ -20,9 +20,9 @@ pub fn linear(args: &LinearArgs<'_>, input: Codes<'_>, output: CodesMut<'_>, scr
 fn run<T: Code>(args: &LinearArgs<'_>, input: Codes<'_>, output: &mut [T], mut scratch: &mut [u8]) {
     let (positions, depth) = (index(args.positions), usize::from(args.inputs));
     let product = Product {
-        weights: args.weights,
+        weights: Weights::new(args.kernel, args.weights, args.outputs, depth),
         depth,
-        first_channel: 0,
+        channels: 0..usize::from(args.outputs),
         outputs: usize::from(args.outputs),
         rescale: &args.rescale,
         wide: args.wide,
@@ -34,14 +34,16 @@ fn run<T: Code>(args: &LinearArgs<'_>, input: Codes<'_>, output: &mut [T], mut s
     match input {
         Codes::I8(input) => {
             let Some(tile) = take::<i16>(&mut scratch, tile_len) else { return };
+            let Some(buffer) = product.weights.buffer(&mut scratch, depth) else { return };
             for (i, codes) in input.chunks(tile_len).enumerate() {
                 widen(codes, tile);
-                product.tile(tile.get(..codes.len()).unwrap_or_default(), i * TILE, output);
+                product.tile(tile.get(..codes.len()).unwrap_or_default(), i * TILE, output, buffer);
             }
         }
         Codes::I16(input) => {
+            let Some(buffer) = product.weights.buffer(&mut scratch, depth) else { return };
             for (i, rows) in input.chunks(tile_len).enumerate() {
-                product.tile(rows, i * TILE, output);
+                product.tile(rows, i * TILE, output, buffer);
             }
         }
     }
@@ -50,7 +52,7 @@ fn run<T: Code>(args: &LinearArgs<'_>, input: Codes<'_>, output: &mut [T], mut s
 #[cfg(test)]
 mod tests {
     extern crate std;
-    use super::super::oracle::{Buffer, HOSTILE, RescaleConstants, Scratch, for_seeds, rescale};
+    use super::super::oracle::{Buffer, HOSTILE, RescaleConstants, Scratch, for_seeds, pack, rescale};
     use super::*;
     use crate::kernels::plan::linear_scratch_bytes;
     use crate::program::KernelId;
@@ -89,10 +91,14 @@ mod tests {
             let kernel = KernelId::Direct;
             let args = LinearArgs { positions, inputs, outputs, kernel, weights: &weights, wide, rescale };
             let expected = expected(&args, &input, &constants.residual_buffer);
-            let mut output = constants.initial_output(rng);
-            let mut scratch = Scratch::new(linear_scratch_bytes(kernel, inputs, outputs, element_type));
-            linear(&args, input.codes(), output.codes_mut(), scratch.bytes());
-            output.assert_equals(&expected, "linear");
+            for kernel in KernelId::ALL {
+                let packed = pack(*kernel, &weights, 1, outputs, inputs.into());
+                let args = LinearArgs { kernel: *kernel, weights: &packed, ..args };
+                let mut output = constants.initial_output(rng);
+                let mut scratch = Scratch::new(linear_scratch_bytes(*kernel, positions, inputs, element_type));
+                linear(&args, input.codes(), output.codes_mut(), scratch.bytes());
+                output.assert_equals(&expected, &std::format!("{kernel:?} linear"));
+            }
         });
     }
 

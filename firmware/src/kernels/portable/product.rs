@@ -1,22 +1,58 @@
 //! The matrix product under convolution and linear layers: a tile of rows times weights, with the epilogue.
 
-use super::codes::{Code, block, element, operand};
+use super::codes::{Code, block, element, operand, take};
 use crate::fault::{self, Fault};
 use crate::fixed_point::{finish, round_shift};
+use crate::kernels::k4n16::Packed;
 use crate::kernels::{RescaleArgs, ResidualArgs};
-use crate::program::Requant;
+use crate::program::{KernelId, Requant};
 
 /// Rows that are multiplied at once: each weight is loaded and widened once for all of them.
 pub(super) const TILE: usize = crate::kernels::plan::TILE_ROWS as usize;
 
-/// Weights `[channels][depth]` of consecutive output channels and what follows their accumulators.
+/// Packed weights, read one output channel at a time.
+#[derive(Clone, Copy)]
+pub(super) enum Weights<'a> {
+    /// Depth contiguous: each row lies there as it is.
+    Direct { codes: &'a [i8], depth: usize },
+    /// Blocks: each row is copied together.
+    K4N16(Packed<'a>),
+}
+
+impl<'a> Weights<'a> {
+    /// Weights of groups of `outputs` output channels with `depth` weights each.
+    pub(super) fn new(kernel: KernelId, codes: &'a [i8], outputs: u16, depth: usize) -> Self {
+        match kernel {
+            KernelId::Direct => Self::Direct { codes, depth },
+            KernelId::K4N16 => Self::K4N16(Packed::new(codes, outputs, depth)),
+        }
+    }
+
+    /// Room for one row out of scratch, where rows are copied together.
+    pub(super) fn buffer<'s>(&self, scratch: &mut &'s mut [u8], depth: usize) -> Option<&'s mut [i8]> {
+        match self {
+            Self::Direct { .. } => Some(&mut []),
+            Self::K4N16(_) => take(scratch, depth),
+        }
+    }
+
+    /// The weights of an output channel, depth contiguous.
+    fn row<'r>(&'r self, channel: usize, buffer: &'r mut [i8]) -> Option<&'r [i8]> {
+        match self {
+            Self::Direct { codes, depth } => block(codes, channel, *depth),
+            Self::K4N16(packed) => packed.unpack(channel, buffer).map(|()| &*buffer),
+        }
+    }
+}
+
+/// Weights of consecutive output channels and what follows their accumulators.
 pub(super) struct Product<'a> {
-    /// `i8` codes, `channels · depth`.
-    pub weights: &'a [i8],
+    /// Weights of all output channels.
+    pub weights: Weights<'a>,
     /// Elements of one dot product.
     pub depth: usize,
-    /// Output channel of the first row of `weights`.
-    pub first_channel: usize,
+    /// The output channels that are computed.
+    pub channels: core::ops::Range<usize>,
     /// Channels of one position of the output (all groups).
     pub outputs: usize,
     /// Epilogue; arrays are indexed by output channel.
@@ -26,30 +62,34 @@ pub(super) struct Product<'a> {
 }
 
 impl Product<'_> {
-    /// Multiplies up to [`TILE`] rows of `depth` widened codes and writes the channels of `weights` at as many
-    /// positions of `output` from `position` on. `rows.len()` is a multiple of `depth`.
-    pub(super) fn tile<T: Code>(&self, rows: &[i16], position: usize, output: &mut [T]) {
+    /// Multiplies up to [`TILE`] rows of `depth` widened codes and writes `channels` at as many positions of `output`
+    /// from `position` on. `rows.len()` is a multiple of `depth`; `buffer` is that of [`Weights::buffer`].
+    pub(super) fn tile<T: Code>(&self, rows: &[i16], position: usize, output: &mut [T], buffer: &mut [i8]) {
         let row = |i| block(rows, i, self.depth);
         if let [Some(a), Some(b), Some(c), Some(d)] = [row(0), row(1), row(2), row(3)] {
-            return self.rows([a, b, c, d], position, output);
+            return self.rows([a, b, c, d], position, output, buffer);
         }
         for (i, row) in (0..TILE).map_while(|i| Some((i, row(i)?))) {
-            self.rows([row], position + i, output);
+            self.rows([row], position + i, output, buffer);
         }
     }
 
-    fn rows<T: Code, const ROWS: usize>(&self, rows: [&[i16]; ROWS], position: usize, output: &mut [T]) {
+    fn rows<T: Code, const ROWS: usize>(
+        &self,
+        rows: [&[i16]; ROWS],
+        position: usize,
+        output: &mut [T],
+        buffer: &mut [i8],
+    ) {
         if self.depth == 0 {
             return;
         }
         let depth = self.depth - usize::from(fault::active(Fault::DepthTail));
         let rows = rows.map(|row| row.get(..depth).unwrap_or_default());
-        let swapped = fault::active(Fault::ChannelsSwapped) && self.first_channel == 0;
-        for (i, weights) in self.weights.chunks_exact(self.depth).enumerate() {
-            let weights =
-                if swapped && i < 2 { block(self.weights, 1 - i, self.depth).unwrap_or(weights) } else { weights };
-            let weights = weights.get(..depth).unwrap_or_default();
-            let channel = self.first_channel + i;
+        let swapped = fault::active(Fault::ChannelsSwapped) && self.channels.start == 0 && self.channels.end > 1;
+        for channel in self.channels.clone() {
+            let source = if swapped && channel < 2 { 1 - channel } else { channel };
+            let Some(weights) = self.weights.row(source, buffer).and_then(|row| row.get(..depth)) else { return };
             let epilogue = Epilogue::new(self.rescale, channel);
             let sums = if self.wide { dot_wide(weights, rows) } else { dot(weights, rows).map(i64::from) };
             for (row, sum) in sums.into_iter().enumerate() {

@@ -68,6 +68,7 @@ fn frame() -> Frame {
         goal: Some([1.0, -20.0]),
         command: None,
         dropped_points: 3,
+        label: None,
     }
 }
 

@@ -1,0 +1,155 @@
+//! Operators on maps: pools, sums, changes of scale, resize.
+
+use super::draw::Draw;
+use super::{Case, Outcome, code_bits};
+use crate::kernels::{PoolArgs, ResizeArgs, TermArgs, plan};
+use crate::program::Window;
+use crate::tensor::{ElementType, Shape, index};
+
+/// Channels on both sides of what kernels take at once.
+const CHANNELS: [u16; 14] = [1, 2, 3, 7, 8, 15, 16, 17, 31, 32, 33, 64, 65, 130];
+
+/// A pool with kernels up to 4; padding stays inside the kernel.
+fn pool(draw: &mut Draw<'_>, padded: bool) -> Option<PoolArgs> {
+    let input_shape = Shape::map(draw.size(1, 9), draw.size(1, 9), draw.one_of(&CHANNELS));
+    let (kernel_h, kernel_w) = (draw.byte(1, 4), draw.byte(1, 4));
+    let mut pad = |kernel: u8| if padded { draw.byte(0, kernel - 1) } else { 0 };
+    let (pad_top, pad_bottom, pad_left, pad_right) = (pad(kernel_h), pad(kernel_h), pad(kernel_w), pad(kernel_w));
+    let window = Window {
+        kernel_h,
+        kernel_w,
+        stride_h: draw.byte(1, 3),
+        stride_w: draw.byte(1, 3),
+        pad_top,
+        pad_bottom,
+        pad_left,
+        pad_right,
+        dilation_h: 1,
+        dilation_w: 1,
+    };
+    let (height, width) = window.output_size(input_shape.height, input_shape.width)?;
+    Some(PoolArgs { input_shape, output_shape: Shape::map(height, width, input_shape.channels), window })
+}
+
+/// Apart, and in place where that is right.
+pub(super) fn max_pool(case: &mut Case<'_>, _: u32) -> Outcome {
+    let Some(args) = pool(&mut case.draw, true) else { return Some(Ok(0)) };
+    let element = case.draw.element();
+    let in_place = plan::max_pool_in_place(args.input_shape, args.output_shape, args.window) && case.draw.flag();
+    let input = case.draw.map(element, args.input_shape)?;
+    case.describe(format_args!("{element:?} {args:?}, in place: {in_place}"));
+    let elements = usize::try_from(args.output_shape.elements()).ok()?;
+    if in_place {
+        return case.compare(input, elements, |kernels, output| kernels.max_pool(&args, None, output));
+    }
+    let (codes, stored) = (input.codes()?, case.draw.map(element, args.output_shape)?);
+    case.compare(stored, elements, |kernels, output| kernels.max_pool(&args, Some(codes), output))
+}
+
+pub(super) fn average_pool(case: &mut Case<'_>, _: u32) -> Outcome {
+    let Some(args) = pool(&mut case.draw, false) else { return Some(Ok(0)) };
+    let draw = &mut case.draw;
+    let (input, output) = (draw.element(), draw.element());
+    let requant = draw.requant_args(input, code_bits(input) + 2, output);
+    let (codes, stored) = (draw.map(input, args.input_shape)?.codes()?, draw.map(output, args.output_shape)?);
+    case.describe(format_args!("{input:?} {args:?} to {output:?}"));
+    let elements = usize::try_from(args.output_shape.elements()).ok()?;
+    case.compare(stored, elements, |kernels, output| kernels.average_pool(&args, &requant, codes, output))
+}
+
+/// One or two maps.
+pub(super) fn global_pool(case: &mut Case<'_>, _: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let (channels, output) = (draw.one_of(&CHANNELS), draw.element());
+    let positions = [draw.size(1, 70), draw.size(1, 70)];
+    let [first, second] = positions.map(|positions| {
+        let element = draw.element();
+        let codes = draw.codes(element, usize::from(positions) * usize::from(channels))?.codes()?;
+        Some(TermArgs { codes: Some(codes), zero_point: draw.zero_point(element), multiplier: draw.word(1, 1 << 24) })
+    });
+    let terms = [first?, second?];
+    let count = if draw.flag() { 1 } else { 2 };
+    let sum = draw.sum(output, (24, 40));
+    let stored = draw.codes(output, channels.into())?;
+    case.describe(format_args!("{count} maps of {positions:?} positions, {channels} channels, to {output:?}"));
+    case.compare(stored, channels.into(), |kernels, output| {
+        kernels.global_pool(channels, &sum, terms.get(..count).unwrap_or_default(), output);
+    })
+}
+
+/// Every length; each operand apart or in place.
+pub(super) fn add(case: &mut Case<'_>, number: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let (len, output) = (index(number % 200) + 1, draw.element());
+    let [first, second] = [(); 2].map(|()| {
+        let in_place = draw.flag();
+        let element = if in_place { output } else { draw.element() };
+        let codes = if in_place { None } else { Some(draw.codes(element, len)?.codes()?) };
+        Some(TermArgs { codes, zero_point: draw.zero_point(element), multiplier: draw.word(1, i32::MAX) })
+    });
+    let terms = [first?, second?];
+    let sum = draw.sum(output, (24, 40));
+    let stored = draw.codes(output, len)?;
+    let in_place = terms.map(|term| term.codes.is_none());
+    case.describe(format_args!("{len} elements to {output:?}, in place: {in_place:?}"));
+    case.compare(stored, len, |kernels, output| kernels.add(&sum, &terms, output))
+}
+
+/// Every length.
+pub(super) fn requantize(case: &mut Case<'_>, number: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let (len, input, output) = (index(number % 200) + 1, draw.element(), draw.element());
+    let args = draw.requant_args(input, code_bits(input), output);
+    let (codes, stored) = (draw.codes(input, len)?.codes()?, draw.codes(output, len)?);
+    case.describe(format_args!("{len} elements of {input:?} to {output:?}"));
+    case.compare(stored, len, |kernels, output| kernels.requantize(&args, codes, output))
+}
+
+/// Whole factors; with a residual apart, in place, or none.
+pub(super) fn resize_bilinear(case: &mut Case<'_>, _: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let (factor_h, factor_w) = (draw.one_of(&[1, 2, 3, 4, 8]), draw.one_of(&[1, 2, 3, 4, 5, 8]));
+    let weight_bits = draw.one_of(&[4, 11]);
+    let input_shape = Shape::map(draw.size(1, 5), draw.size(1, 5), draw.one_of(&CHANNELS));
+    let output_shape =
+        Shape { height: input_shape.height * factor_h, width: input_shape.width * factor_w, ..input_shape };
+    let (input, output, in_place) = (draw.element(), draw.element(), draw.flag());
+    let multiplier = draw.word(1, 1 << if input == ElementType::I8 { 24 } else { 16 });
+    let codes = Some(draw.map(input, input_shape)?.codes()?);
+    let term = TermArgs { codes, zero_point: draw.zero_point(input), multiplier };
+    let residual = if draw.flag() {
+        let element = if in_place { output } else { draw.element() };
+        let codes = if in_place { None } else { Some(draw.map(element, output_shape)?.codes()?) };
+        Some(TermArgs { codes, zero_point: draw.zero_point(element), multiplier: draw.word(1, 1 << 24) })
+    } else {
+        None
+    };
+    let args = ResizeArgs {
+        input_shape,
+        output_shape,
+        input: term,
+        residual,
+        rows: axis(draw, input_shape.height, factor_h, weight_bits)?,
+        columns: axis(draw, input_shape.width, factor_w, weight_bits)?,
+        weight_bits,
+        sum: draw.sum(output, (24, 36)),
+    };
+    let stored = draw.map(output, output_shape)?;
+    let kind = residual.map(|term| if term.codes.is_none() { "in place" } else { "apart" });
+    case.describe(format_args!("{input:?} {input_shape:?} to {output:?} {output_shape:?}, residual: {kind:?}"));
+    let elements = usize::try_from(output_shape.elements()).ok()?;
+    case.compare(stored, elements, |kernels, output| kernels.resize_bilinear(&args, output))
+}
+
+/// `[i0, w1]` of half-pixel centers: `src = max((d + ½)·in/out − ½, 0)` in units of `1/(2·factor)`.
+fn axis<'m>(draw: &mut Draw<'m>, size: u16, factor: u16, weight_bits: u32) -> Option<&'m [[u16; 2]]> {
+    let lines = draw.take::<[u16; 2]>(usize::from(size) * usize::from(factor))?;
+    let unit = 2 * u32::from(factor);
+    for (d, line) in (0_u32..).zip(lines.iter_mut()) {
+        let source = (2 * d + 1).saturating_sub(u32::from(factor));
+        let first = (source / unit).min(u32::from(size) - 1);
+        let weight = (((source - first * unit) << weight_bits) + unit / 2) / unit;
+        *line = [u16::try_from(first).ok()?, u16::try_from(weight).ok()?];
+    }
+    Some(lines)
+}
