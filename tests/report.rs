@@ -48,7 +48,7 @@ fn check(value: &Value, schema: &Value, root: &Value, at: &str) -> Result<(), St
         Value::Array(_) => "array",
         Value::Object(_) => "object",
     };
-    if !types.contains(&found) && !(found == "integer" && types.contains(&"number")) {
+    if !(types.contains(&found) || found == "integer" && types.contains(&"number")) {
         return fail(format!("found {found}, expected {types:?}"));
     }
     if let Value::Array(items) = value {

@@ -11,6 +11,7 @@ use model_compiler::frames::Frame;
 
 mod changes;
 mod channels;
+mod classes;
 mod frames;
 mod gates;
 mod graph;
@@ -40,6 +41,7 @@ pub fn page(report: &VerifyReport, frames: &[Frame]) -> String {
         (channels::section(&report.steps))
         (memory::section(&report.memory, &report.summary))
         (waypoints::section(&report.frames, frames))
+        (classes::section(report.summary.accuracy.as_ref(), &report.frames))
         (frames::section(&report.frames))
         (steps::section(&report.steps))
     };

@@ -1,9 +1,12 @@
-//! Every frame, the worst first.
+//! Figures per frame, the worst first.
 
 use super::table;
 use crate::report::FrameReport;
 use crate::report::figures::figure;
 use maud::{Markup, html};
+
+/// Frames in the table.
+const SHOWN: usize = 200;
 
 pub(super) fn section(frames: &[FrameReport]) -> Markup {
     if frames.iter().all(|frame| frame.worst_sqnr_db.is_none()) {
@@ -23,9 +26,12 @@ pub(super) fn section(frames: &[FrameReport]) -> Markup {
             errors.join(", "),
         ]
     };
-    let rows: Vec<_> = sorted.iter().map(row).collect();
+    let rows: Vec<_> = sorted.iter().take(SHOWN).map(row).collect();
     let header =
         ["frame", "calibration", "worst step", "its dB", "pooled vector, dB", "first output, dB", "waypoint error, mm"];
-    let about = html! { "Figures of every frame by itself, the worst first." };
+    let about = html! {
+        "Figures of every frame by itself, the worst first."
+        @if sorted.len() > SHOWN { " Shown are " (SHOWN) " of " (sorted.len()) " frames." }
+    };
     super::section("frames", "Frames", &about, &table(&header, 3, &rows))
 }
