@@ -68,7 +68,7 @@ fn verified(seed: u64, graph: &Graph, compiled: &Compiled, backend: Backend) -> 
 
 #[test]
 fn random_networks_are_byte_exact_and_close_to_f32() {
-    let mut steps: BTreeMap<&str, usize> = BTreeMap::new();
+    let mut steps: BTreeMap<String, usize> = BTreeMap::new();
     let (mut worst_local, mut worst) = (f64::INFINITY, f64::INFINITY);
     for seed in 0..NETWORKS {
         let (graph, compiled) = compiled(seed);
@@ -76,7 +76,7 @@ fn random_networks_are_byte_exact_and_close_to_f32() {
             let report = verified(seed, &graph, &compiled, backend);
             assert!(report.bytes_equal, "seed {seed}: {:?}", report.first_difference);
             for step in &report.steps {
-                *steps.entry(step.op).or_default() += 1;
+                *steps.entry(step.op.to_string()).or_default() += 1;
                 let (local, all) = (step.local_sqnr_db.unwrap_or(f64::INFINITY), step.sqnr_db.unwrap_or(f64::NAN));
                 assert!(local >= LOCAL_FLOOR_DB, "seed {seed}, step {}: {local} dB alone", step.step);
                 assert!(all >= FLOOR_DB, "seed {seed}, step {}: {all} dB", step.step);

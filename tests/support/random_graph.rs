@@ -54,6 +54,7 @@ pub fn frames(graph: &Graph, seed: u64, count: usize) -> Vec<Frame> {
             goal: None,
             command: None,
             dropped_points: 0,
+            label: None,
         }
     };
     (0..count).map(frame).collect()
