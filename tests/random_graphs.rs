@@ -1,5 +1,5 @@
-//! Random small classifiers through the whole chain: passes, quantizer, planner, image, engine. The engine's bytes are the
-//! f64 model's in every step on every backend, and the numbers stay close to f32.
+//! Random small classifiers through the whole chain: passes, quantizer, planner, image, engine. The engine's bytes are
+//! the f64 model's in every step on every backend, and the numbers stay close to f32.
 
 use firmware::engine::Engine;
 use firmware::image::Image;

@@ -538,8 +538,9 @@ pub struct ConcatSource {
     pub requant: Requant,
 }
 
-/// Two maps one behind the other along an axis, equal in the other two: `y = clamp(z_o + R((q − z)·M, n))`, each operand
-/// with its own z, M and n.
+/// Two maps one behind the other along an axis, equal in the other two.
+///
+/// `y = clamp(z_o + R((q − z)·M, n))`, each operand with its own z, M and n.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Concat {
     /// The operand in front.

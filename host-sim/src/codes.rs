@@ -59,8 +59,8 @@ fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
     }
 }
 
-/// The output bounds at which codes saturate; `None` for bounds of the network itself (ReLU, clip), which are no loss. So
-/// is a lower bound equal to the zero point.
+/// The output bounds at which codes saturate; `None` for bounds of the network itself (ReLU, clip), which are no loss,
+/// and for a lower bound equal to the zero point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SaturationBounds {
     min: Option<i16>,

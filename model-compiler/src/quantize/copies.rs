@@ -20,9 +20,9 @@ pub(super) fn use_counts(graph: &Graph) -> Vec<u32> {
 }
 
 /// Gives each copy the storage of its operand. Before that:
-/// * an operand that only a concatenation reads gets the storage of the whole: its codes are then moved, not rescaled
-/// * an operand that only a clip reads gets the storage of what the clip leaves: its step will carry the bounds. Whatever
-///   that step reads keeps storage of its own, for it is not within the bounds.
+/// * an operand that only a concatenation reads gets the storage of the whole: its codes are moved, not rescaled
+/// * an operand that only a clip reads gets the storage of what the clip leaves: its step will carry the bounds; what
+///   that step reads keeps storage of its own, for it is not within the bounds
 pub(super) fn share_storage(graph: &Graph, roles: &[Role], types: &mut [Stored]) {
     let uses = use_counts(graph);
     let mut joined = vec![false; types.len()];
