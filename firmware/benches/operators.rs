@@ -1,8 +1,8 @@
 //! Time of each heavy operator on every backend of this machine, at shapes of the full-size TransFuser.
 //!
-//! `cargo bench -p firmware` measures all, `cargo bench -p firmware -- conv2d` some of them; `-- --test` runs each once.
-//! Throughput counts multiply-accumulates for convolutions, linear layers and attention, elements of the input for pools
-//! and tokens, elements of the output for the others.
+//! `cargo bench -p firmware --bench operators` measures all, with `-- conv2d` some of them, and with `-- --test` runs
+//! each once. Throughput counts multiply-accumulates for convolutions, linear layers and attention, elements of the
+//! input for pools and tokens, elements of the output for the others.
 //! Before it is measured, a backend must give the bytes of the portable kernels.
 
 use criterion::{BenchmarkId, Criterion, Throughput};

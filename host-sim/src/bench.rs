@@ -1,8 +1,8 @@
 //! Latency of an image: whole inferences and single steps, the backends of the machine side by side in one run.
 //!
-//! What an inference does does not depend on its inputs, so seeded ones serve. Steps are timed in inferences of their
-//! own, for the clock is read twice per step and would disturb the whole. Backends take turns within every round, so that
-//! whatever else the machine does hits all of them alike. Nothing is timed before every backend has given the right
+//! The work of an inference does not depend on its inputs, so seeded ones serve. Steps are timed in inferences of their
+//! own, for the clock is read twice per step and would disturb the whole. Backends take turns within every round, so
+//! that whatever else the machine does hits all of them alike. Nothing is timed before every backend has given the right
 //! bytes in every step.
 
 mod clock;

@@ -1,7 +1,7 @@
 //! Runs the firmware's engine on the host and says how good its numbers are.
 //!
 //! * [`backends`]: which of the firmware's kernels this machine can run
-//! * [`bench`]: latency per step and whole, the backends side by side
+//! * [`mod@bench`]: latency per step and whole, the backends side by side
 //! * [`demo`]: the whole way on the files of the source tree, without arguments
 //! * [`run`]: waypoints or classes of frames, int8 from an image or f32 from a checkpoint
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the

@@ -53,6 +53,16 @@ fn sample_is_accepted() {
 }
 
 #[test]
+fn work_is_the_sum_over_the_steps() {
+    let bytes = sample();
+    let image = Image::parse(&bytes).expect("parses");
+    let work: Vec<u64> = (0..image.step_count()).filter_map(|position| image.step_work(position)).collect();
+    assert_eq!((work.len(), work.iter().sum::<u64>()), (STEPS, image.work()));
+    assert!(work.iter().all(|&work| work > 0), "{work:?}");
+    assert_eq!(image.step_work(image.step_count()), None);
+}
+
+#[test]
 fn equal_parts_give_equal_bytes() {
     assert_eq!(assemble(&sample_image::parts()), assemble(&sample_image::parts()));
 }
