@@ -5,6 +5,7 @@
 
 use firmware::fault;
 use firmware::image::{Check, Image, SectionKind, layout};
+use host_sim::backends::{Backend, BackendKind};
 use model_compiler::emit::{AlignedBytes, assemble, emit, reseal};
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -74,26 +75,28 @@ fn accepted_images_run_with_any_constants() {
     let _turn = turn();
     let start = Instant::now();
     println!("seed {SEED:#x}");
-    let mut bench = Bench::default();
-    let mut accepted = Vec::new();
-    mutation::visit_all(&every_step::parts(), &mut |what, image| {
-        let image = AlignedBytes::from(image);
-        if Image::parse(&image).is_ok() {
-            accepted.push((what.to_owned(), image));
-        }
-    });
-    let mut random = Random::new(SEED);
-    let mut tally = Tally::default();
-    for (what, image) in &mut accepted {
-        for fill in 0..FILLS {
-            fill_constants(image, &mut random);
-            let what = || format!("seed {SEED:#x}, {what}, fill {fill}");
-            tally.count(trial(&mut bench, image, &what), &what);
-        }
+    let portable = BackendKind::Portable.detect().expect("portable is everywhere");
+    let on_x86 = Backend::all().into_iter().map(|backend| ("x86", backend));
+    for (target, backend) in [("portable", portable)].into_iter().chain(on_x86) {
+        let title = format!("any constants, target {target}, {}", backend.kind().name());
+        let mut bench = Bench::of(backend);
+        let mut random = Random::new(SEED);
+        let mut tally = Tally::default();
+        mutation::visit_all(&every_step::parts_for(target), &mut |what, image| {
+            let mut image = AlignedBytes::from(image);
+            if Image::parse(&image).is_err() {
+                return;
+            }
+            for fill in 0..FILLS {
+                fill_constants(&mut image, &mut random);
+                let what = || format!("seed {SEED:#x}, {title}, {what}, fill {fill}");
+                tally.count(trial(&mut bench, &image, &what), &what);
+            }
+        });
+        tally.print(&title, start);
+        assert!(tally.refused.is_empty(), "parse does not read the constants: {tally:?}");
+        assert!(tally.ran > 1000 * FILLS, "{tally:?}");
     }
-    tally.print("any constants", start);
-    assert!(tally.refused.is_empty(), "parse does not read the constants: {tally:?}");
-    assert!(tally.ran > 1000 * FILLS, "{tally:?}");
 }
 
 /// Sets every word of the constants to an extreme or a random value; each fill prefers another extreme.

@@ -193,6 +193,7 @@ mod tests {
             is_input: (0..tensors).map(|t| t < 2).collect(),
             overwritable: overwritable.collect(),
             writes: (2..tensors).collect(),
+            kernels: vec![None; steps],
             scratch: (0..steps).map(|_| 16 * below(2) as u64).collect(),
             kernels: vec![None; steps],
             reads,

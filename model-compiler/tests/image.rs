@@ -4,10 +4,10 @@
 mod sample_image;
 
 use firmware::engine::{Engine, EngineError, Progress};
-use firmware::image::audit::{AuditError, audit};
+use firmware::image::audit::{Array, AuditError, audit};
 use firmware::image::{Check, CheckProgress, Checker, Image, SectionKind, TensorRecord, crc32, layout};
-use firmware::kernels::{Kernels, Portable};
-use firmware::program::{Clamp, KernelId, Requant, Requantize, Step};
+use firmware::kernels::{Kernels, Portable, k4n16, plan};
+use firmware::program::{Clamp, ConstRange, KernelId, Requant, Requantize, Step};
 use firmware::tensor::{ElementType, Shape, TensorId};
 use model_compiler::emit::{
     AlignedBytes, ConstantsBuilder, ImageParts, ImagePort, KnownAnswer, assemble, emit, reseal, with_known_answer,
@@ -208,6 +208,50 @@ fn audit_refuses_overflow_and_bad_constants() {
     parts.constants[bias..bias + 4].copy_from_slice(&i32::MAX.to_le_bytes());
     let bytes = AlignedBytes::from(emit(&parts).expect("valid").as_slice());
     audit(&Image::parse(&bytes).expect("parses")).expect("64-bit accumulators");
+}
+
+/// The sample with the weights of one layer in blocks of 16 outputs × 4 depth elements.
+fn packed_parts() -> ImageParts {
+    let mut parts = sample_image::parts();
+    let Step::Linear(linear) = &mut parts.steps[at::LINEAR_QUERY] else { panic!("a linear layer") };
+    let weights = &parts.constants[linear.weights.offset as usize..][..64];
+    let weights: Vec<i8> = weights.iter().map(|weight| weight.cast_signed()).collect();
+    let mut packed = vec![0; plan::weight_bytes(KernelId::K4N16, 1, 8, 8) as usize];
+    k4n16::pack(&weights, 8, 8, &mut packed);
+    let scratch = plan::linear_scratch_bytes(KernelId::K4N16, 8, 8, ElementType::I8);
+    linear.kernel = KernelId::K4N16;
+    linear.weights = ConstRange { offset: parts.constants.len() as u32, bytes: packed.len() as u32 };
+    let record = &mut parts.tensors[usize::from(linear.scratch.expect("scratch").0)];
+    (record.offset, record.bytes) = (parts.arena_bytes, scratch);
+    parts.arena_bytes += scratch;
+    parts.constants.extend(packed.iter().map(|weight| weight.cast_unsigned()));
+    parts
+}
+
+#[test]
+fn audit_reads_packed_weights() {
+    let audited = |parts: &ImageParts| {
+        let bytes = AlignedBytes::from(assemble(parts).expect("fits the format").as_slice());
+        audit(&Image::parse(&bytes).unwrap_or_else(|e| panic!("{e}")))
+    };
+    let parts = packed_parts();
+    assert_eq!(audited(&parts), audited(&sample_image::parts()), "the same weights");
+    let Step::Linear(linear) = &parts.steps[at::LINEAR_QUERY] else { panic!("a linear layer") };
+    let block = linear.weights.offset as usize;
+    // Compensation of output 1; weight 5 of output 2; what fills up the depth of output 2 to 64.
+    for (at, value, array, element) in [
+        (block + 4, 1, Array::Compensations, 1),
+        (block + 64 + 64 + 9, 0x80, Array::Weights, 2 * 8 + 5),
+        (block + 64 + 15 * 64 + 9, 1, Array::WeightPadding, 2 * 8 + 61),
+    ] {
+        let mut parts = parts.clone();
+        parts.constants[at] ^= value;
+        if array == Array::Weights {
+            parts.constants[at] = value;
+        }
+        let Err(AuditError::Constant { array: found, element: at, .. }) = audited(&parts) else { panic!("{array:?}") };
+        assert_eq!((found, at), (array, element));
+    }
 }
 
 /// Refuses every kernel.

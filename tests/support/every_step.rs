@@ -98,9 +98,17 @@ pub fn frames(seed: u64, count: usize) -> Vec<Frame> {
 /// # Panics
 /// The compiler refuses it, or an operator or one of its forms is missing in the program.
 pub fn compiled() -> Compiled {
+    compiled_for("portable")
+}
+
+/// The same compiled for a built-in target.
+///
+/// # Panics
+/// As [`compiled`].
+pub fn compiled_for(target: &str) -> Compiled {
     let options = QuantizeOptions { skip: SkipStages::wide(), ..Default::default() };
     let model = pipeline::quantize_graph(&graph(), &frames(SEED, 4), &options, &mut |_, _, _| {});
-    build::compiled(&model.unwrap_or_else(|e| panic!("{e}")))
+    build::compiled_for(&model.unwrap_or_else(|e| panic!("{e}")), target)
 }
 
 /// What the image is made of, with its known answer: for tests that assemble it in another way.
@@ -108,7 +116,15 @@ pub fn compiled() -> Compiled {
 /// # Panics
 /// As [`compiled`].
 pub fn parts() -> ImageParts {
-    let compiled = compiled();
+    parts_for("portable")
+}
+
+/// The same for a built-in target.
+///
+/// # Panics
+/// As [`compiled`].
+pub fn parts_for(target: &str) -> ImageParts {
+    let compiled = compiled_for(target);
     let mut parts = pack(&compiled.record.model, &compiled.record.plan).unwrap_or_else(|e| panic!("{e}"));
     parts.known_answer = Image::parse(&AlignedBytes::from(compiled.image.as_slice())).ok().and_then(stored_answer);
     parts

@@ -2,8 +2,9 @@
 
 use firmware::engine::{Engine, EngineError};
 use firmware::image::{Check, Image, ParseError};
-use firmware::kernels::Portable;
+use firmware::kernels::{Kernels, Portable};
 use firmware::tensor::TensorId;
+use host_sim::backends::{Backend, BackendKind};
 use model_compiler::emit::AlignedBytes;
 
 /// Accepted images beyond these limits are not run; `parse` bounds both, but not by what a test has time and memory for.
@@ -36,9 +37,10 @@ impl Verdict {
     }
 }
 
-/// Memory for trials, used again and again.
+/// A backend and memory for trials, used again and again.
 #[derive(Debug)]
 pub struct Bench {
+    backend: Backend,
     memory: AlignedBytes,
     start: usize,
     noise: Vec<u8>,
@@ -46,15 +48,20 @@ pub struct Bench {
 
 impl Default for Bench {
     fn default() -> Self {
-        let mut memory = AlignedBytes::zeroed(MAX_ARENA + 3 * GUARD);
-        memory.fill(GUARD_BYTE);
-        let start = GUARD + memory.as_ptr().align_offset(GUARD);
-        let noise = (0..MAX_ARENA).map(|i| (i * 167 + (i >> 8)) as u8).collect();
-        Self { memory, start, noise }
+        Self::of(BackendKind::Portable.detect().expect("portable is everywhere"))
     }
 }
 
 impl Bench {
+    /// Trials on a backend.
+    pub fn of(backend: Backend) -> Self {
+        let mut memory = AlignedBytes::zeroed(MAX_ARENA + 3 * GUARD);
+        memory.fill(GUARD_BYTE);
+        let start = GUARD + memory.as_ptr().align_offset(GUARD);
+        let noise = (0..MAX_ARENA).map(|i| (i * 167 + (i >> 8)) as u8).collect();
+        Self { backend, memory, start, noise }
+    }
+
     /// Parses and runs an image on inputs that use all codes.
     ///
     /// # Panics
@@ -77,7 +84,8 @@ impl Bench {
             return Verdict::TooLarge;
         }
         let end = self.start + size;
-        let verdict = match infer(image, &mut self.memory[self.start..end], &self.noise) {
+        let kernels = self.backend.kernels();
+        let verdict = match infer(image, kernels, &mut self.memory[self.start..end], &self.noise) {
             Ok(()) => Verdict::Ran,
             Err(error) => Verdict::Failed(error),
         };
@@ -90,13 +98,13 @@ impl Bench {
 }
 
 /// A whole inference, and every output read.
-fn infer(image: Image<'_>, arena: &mut [u8], noise: &[u8]) -> Result<(), EngineError> {
+fn infer(image: Image<'_>, kernels: &dyn Kernels, arena: &mut [u8], noise: &[u8]) -> Result<(), EngineError> {
     let input = |number| {
         let record = image.input(number).and_then(|port| image.tensor(port.tensor));
         record.and_then(|record| noise.get(..record.bytes as usize)).unwrap_or_default()
     };
     let inputs: Vec<&[u8]> = (0..image.input_count()).map(input).collect();
-    let mut engine = Engine::new(image, Portable, arena)?;
+    let mut engine = Engine::new(image, kernels, arena)?;
     engine.infer(&inputs)?;
     (0..image.output_count()).try_for_each(|number| engine.output(number.into()).map(|_| ()))
 }
