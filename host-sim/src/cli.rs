@@ -43,10 +43,10 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Waypoints of frames: int8 from a model image, f32 from a checkpoint.
+    /// Waypoints of frames: int8 from a model image, f32 from a checkpoint or ONNX file.
     #[command(after_help = EXAMPLES)]
     Run {
-        /// Model image (OUT.img) or checkpoint.
+        /// Model image (OUT.img), checkpoint or ONNX file.
         #[arg(value_name = "OUT.img|MODEL")]
         model: PathBuf,
         #[command(flatten)]
@@ -64,7 +64,7 @@ enum Command {
         /// Model image.
         #[arg(value_name = "OUT.img")]
         image: PathBuf,
-        /// The checkpoint that it was compiled from; without it only bytes are compared.
+        /// The checkpoint or ONNX file that it was compiled from; without it only bytes are compared.
         #[arg(long, value_name = "MODEL")]
         model: Option<PathBuf>,
         #[command(flatten)]
