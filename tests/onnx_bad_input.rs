@@ -212,7 +212,7 @@ fn options_that_do_not_fit() {
         (" --heads 4", "@net.onnx: --heads has no effect on an ONNX file\n  help: leave --heads out"),
         (
             " --mean 1,2 --std 1",
-            "@net.onnx: input image: --mean: found 2 values, expected 1 or 3\n  help: give one value per channel, or one for all",
+            "@net.onnx: input image: --mean: found 2 values for 3 channels\n  help: give one value per channel, or one for all",
         ),
     ] {
         refused_with(&folder, &bytes, options, expected);

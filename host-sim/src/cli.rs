@@ -39,10 +39,10 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Waypoints or classes of frames: int8 from a model image, f32 from a checkpoint.
+    /// Waypoints or classes of frames: int8 from a model image, f32 from a checkpoint or ONNX file.
     #[command(after_help = examples::RUN)]
     Run {
-        /// Model image (OUT.img) or checkpoint.
+        /// Model image (OUT.img), checkpoint or ONNX file.
         #[arg(value_name = "OUT.img|MODEL")]
         model: PathBuf,
         #[command(flatten)]
@@ -60,7 +60,7 @@ enum Command {
         /// Model image.
         #[arg(value_name = "OUT.img")]
         image: PathBuf,
-        /// The checkpoint that it was compiled from; without it only bytes are compared.
+        /// The checkpoint or ONNX file that it was compiled from; without it only bytes are compared.
         #[arg(long, value_name = "MODEL")]
         model: Option<PathBuf>,
         #[command(flatten)]

@@ -195,7 +195,6 @@ mod tests {
             writes: (2..tensors).collect(),
             kernels: vec![None; steps],
             scratch: (0..steps).map(|_| 16 * below(2) as u64).collect(),
-            kernels: vec![None; steps],
             reads,
             alignment: 16,
         }

@@ -91,19 +91,17 @@ pub fn outputs(cases: &[Case]) -> Option<Vec<Vec<f32>>> {
     Some((0..cases.len()).map(|index| floats(std::fs::read(path(index, "output")).expect("an output"))).collect())
 }
 
-/// Imports each case, runs it before and after the passes, and compares both with ONNX Runtime; the number of cases
-/// compared, 0 where it is not installed.
+/// Imports each case, runs it before and after the passes, and compares both with ONNX Runtime where it is installed.
 ///
 /// # Panics
 /// A difference, or a case that is not imported.
-pub fn compare(cases: &[Case]) -> usize {
+pub fn compare(cases: &[Case]) {
     let ours: Vec<_> = cases.iter().map(|case| (case, run(case))).collect();
-    let Some(expected) = outputs(cases) else { return 0 };
+    let Some(expected) = outputs(cases) else { return };
     for ((case, [imported, optimized]), expected) in ours.iter().zip(&expected) {
         assert_close(&format!("{}, as imported", case.name), imported, expected);
         assert_close(&format!("{}, optimized", case.name), optimized, expected);
     }
-    cases.len()
 }
 
 /// Outputs as imported and after the passes, each map in ONNX's order.

@@ -65,3 +65,19 @@ pub fn import(model: &Model, folder: Option<&Path>, options: &ImportOptions) -> 
     translator.problems.into_result()?;
     Ok(translator.graph)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::is_onnx;
+
+    #[test]
+    fn files_are_told_from_their_first_fields() {
+        for bytes in [&b"\x08\x07"[..], b"\x08\x08\x12\x07pytorch", b"\x08\x04:\x00", b"\x08\x0a\xa2\x01"] {
+            assert!(is_onnx(bytes), "{}", bytes.escape_ascii());
+        }
+        let safetensors = b"\x08\x01\x12\0\0\0\0\0{\"a\"";
+        for bytes in [&b""[..], b"\x08", b"\x08\x00\x12", b"\x08\x07\x00", b"PK\x03\x04", b"\x80\x02", safetensors] {
+            assert!(!is_onnx(bytes), "{}", bytes.escape_ascii());
+        }
+    }
+}

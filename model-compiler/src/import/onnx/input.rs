@@ -97,9 +97,25 @@ fn normalization(given: Option<&Normalization>, shape: Shape) -> Result<Normaliz
         [one] => Ok(vec![*one; channels]),
         values if values.len() == channels => Ok(values.to_vec()),
         values => {
-            let message = format!("found {} values, expected 1 or {channels}", values.len());
+            let message = format!("found {} values for {channels} channels", values.len());
             Err(Error::new(ErrorCode::Usage, option, message).with_help("give one value per channel, or one for all"))
         }
     };
     Ok(Normalization { mean: spread("--mean", &given.mean)?, std: spread("--std", &given.std)? })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_value_stands_for_all_channels_and_absent_ones_for_the_usual() {
+        let (rgb, grey) = (Shape::map(8, 8, 3), Shape::map(8, 8, 1));
+        let statistics = |mean: &[f32], std: &[f32]| Normalization { mean: mean.to_vec(), std: std.to_vec() };
+        assert_eq!(normalization(None, rgb).unwrap(), statistics(&IMAGE_MEAN, &IMAGE_STD));
+        assert_eq!(normalization(None, grey).unwrap(), statistics(&[0.0], &[255.0]));
+        let given = statistics(&[127.5], &[1.0, 2.0, 3.0]);
+        assert_eq!(normalization(Some(&given), rgb).unwrap(), statistics(&[127.5; 3], &[1.0, 2.0, 3.0]));
+        assert_eq!(normalization(Some(&given), grey).unwrap_err().message, "found 3 values for 1 channels");
+    }
 }

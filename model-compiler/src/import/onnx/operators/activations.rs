@@ -1,6 +1,7 @@
 //! Operators that keep every extent: `Relu`, `Clip`, `Identity`, `Dropout`.
 
 use crate::error::Result;
+use crate::import::checkpoint::TensorData;
 use crate::import::onnx::activation::{Activation, Value};
 use crate::import::onnx::node::Node;
 use crate::import::onnx::translate::Translator;
@@ -50,7 +51,6 @@ fn push(t: &mut Translator<'_>, node: &Node<'_>, clip: Clip) -> Result<Value> {
 
 /// A single floating value; not necessarily finite.
 pub(super) fn scalar(t: &mut Translator<'_>, node: &Node<'_>, index: usize) -> Result<Option<f32>> {
-    use crate::import::checkpoint::TensorData;
     let Some(tensor) = t.constant(node, index)? else { return Ok(None) };
     match &*tensor.data {
         TensorData::Float(values) if values.len() == 1 => Ok(Some(values[0])),

@@ -13,15 +13,14 @@ pub(super) fn softmax(t: &mut Translator<'_>, node: &Node<'_>) -> Result<Value> 
     let is_flattening = node.opset < 13;
     let axis = node.axis(node.int("axis", if is_flattening { 1 } else { -1 })?, rank)?;
     let axes = if is_flattening { axis..rank } else { axis..axis + 1 };
-    let long = |axis: &usize| x.dims[*axis] > 1;
-    let channels = x.has_channels_second() && x.map_axes().is_some() || x.shape.positions() == 1;
-    let covers_channels = if x.shape.positions() == 1 {
+    let is_long = |axis: &usize| x.dims[*axis] > 1;
+    let is_over_channels = if x.shape.positions() == 1 {
         // A vector in whatever extents: all its elements, wherever they lie.
-        (0..rank).filter(long).all(|axis| axes.contains(&axis)) && x.shape.channels > 1
+        (0..rank).filter(is_long).all(|axis| axes.contains(&axis)) && x.shape.channels > 1
     } else {
-        axes == (1..2)
+        x.is_map() && axes == (1..2)
     };
-    if !channels || !covers_channels {
+    if !is_over_channels {
         let found = x.described();
         return Err(node.unsupported(format!("softmax over axes {axes:?} of {found}, expected over the channels")));
     }
