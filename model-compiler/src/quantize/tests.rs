@@ -31,7 +31,7 @@ fn quantized(graph: &mut Graph, output: ValueId) -> Result<QModel> {
     let count = graph.value(input).shape.elements();
     let frames = [vec![(0..count).map(|i| (i * 37 % 256) as f32).collect()]];
     let statistics = calibrate(graph, &frames, |_, _| ())?;
-    quantize(graph, &frames, &statistics, &QuantizeOptions::default())
+    quantize(graph, &frames, &statistics, &QuantizeOptions::default(), |_, _| ())
 }
 
 fn names(model: &QModel) -> Vec<(&str, &str)> {
