@@ -128,6 +128,7 @@ enum Command {
         common: Common,
     },
     /// JSON Schema of the report that `verify --json` and report.json hold.
+    #[command(after_help = examples::SCHEMA)]
     Schema {
         #[command(flatten)]
         common: Common,

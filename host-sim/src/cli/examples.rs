@@ -29,6 +29,9 @@ pub const DIFF: &str = "Examples:
   host-sim diff old/report.json new/report.json
   host-sim diff old/report.json new/report.json --max-loss 1 --report out/";
 
+pub const SCHEMA: &str = "Examples:
+  host-sim schema";
+
 pub const ABLATE: &str = "Examples:
   host-sim ablate transfuser.pth --calib frames/ --frames drive/
   host-sim ablate transfuser.pth --calib inputs.safetensors --inputs inputs.safetensors --mirror --json";

@@ -56,7 +56,7 @@ fn figures(summary: &ClassificationSummary) -> Vec<(&'static str, String)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::classification::{Classification, Comparison};
+    use crate::classification::Comparison;
     use crate::report::tests::report;
     use model_compiler::frames::{Frame, Label};
 
@@ -64,15 +64,10 @@ mod tests {
     fn frames_that_differ_come_first() {
         let mut comparison = Comparison::default();
         let mut frames = Vec::new();
-        for (name, int8, float) in [("same", [0.0, 1.0], [0.0, 2.0]), ("differs", [3.0, 1.0], [0.0, 2.0])] {
+        for (name, int8, float) in [("same", [0.0_f32, 1.0], [0.0_f32, 2.0]), ("differs", [3.0, 1.0], [0.0, 2.0])] {
             let label = Some(Label { class: 1, name: String::new() });
             let frame = Frame { name: name.into(), label, ..Frame::default() };
-            let classes = ClassifiedFrame {
-                int8: Classification::new(int8.to_vec(), &frame),
-                reference_logits: Some(float.to_vec()),
-                reference_top1: Some(1),
-            };
-            comparison.add(&frame, &int8.map(|v| v as f32), Some(&float.map(|v| v as f32)));
+            let classes = comparison.add(&frame, &int8, Some(&float));
             frames.push(FrameReport { name: name.into(), classes: Some(classes), ..report().frames[0].clone() });
         }
         let page = section(comparison.summary().as_ref(), &frames).into_string();
