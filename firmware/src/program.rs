@@ -518,7 +518,7 @@ impl Axis {
     pub const fn run(self, shape: Shape) -> u64 {
         match self {
             Self::Height => shape.elements(),
-            Self::Width => shape.width as u64 * shape.channels as u64,
+            Self::Width => (shape.width as u64).saturating_mul(shape.channels as u64),
             Self::Channels => shape.channels as u64,
         }
     }
@@ -535,8 +535,9 @@ pub struct ConcatSource {
     pub requant: Requant,
 }
 
-/// Two maps one behind the other along an axis, equal in the other two: `y = clamp(z_o + R((q − z)·M, n))`, each operand
-/// with its own z, M and n.
+/// Two maps one behind the other along an axis, equal in the other two.
+///
+/// `y = clamp(z_o + R((q − z)·M, n))`, each operand with its own z, M and n.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Concat {
     /// The operand in front.

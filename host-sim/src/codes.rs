@@ -30,8 +30,8 @@ pub fn dequantize(tensor: &QTensor, codes: &[i32]) -> Vec<f32> {
     codes.iter().map(real).collect()
 }
 
-/// The output bounds at which codes saturate; `None` for bounds of the network itself (ReLU, clip), which are no loss. So
-/// is a lower bound equal to the zero point.
+/// The output bounds at which codes saturate; `None` for bounds of the network itself (ReLU, clip), which are no loss,
+/// and for a lower bound equal to the zero point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SaturationBounds {
     min: Option<i16>,

@@ -26,6 +26,8 @@ mod rounding;
 mod softmax;
 mod sums;
 pub mod tables;
+#[cfg(test)]
+mod tests;
 mod token;
 pub mod types;
 mod weighted;

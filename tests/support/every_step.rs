@@ -211,8 +211,8 @@ impl Builder {
         [("ln_f.image", 0), ("ln_f.lidar", 4)].map(|(name, first_row)| self.layer_norm(name, x, first_row, (2, 2)))
     }
 
-    /// Every other pixel of one map in a border of channels (the shortcut without weights), bordered pixels of the other
-    /// within bounds, both joined; probabilities per pixel of that, and of a corner of an input.
+    /// Every other pixel of one map in a border of channels (the shortcut without weights), bordered pixels of the
+    /// other within bounds, both joined; probabilities per pixel of that, and of a corner of an input.
     fn classifier(&mut self, image: ValueId, lidar: ValueId, bev: ValueId) -> ValueId {
         let every_other = Slice { begin: [1, 0, 1], end: [4, 4, 4], stride: [2, 2, 1] };
         let sliced = self.push("class.slice", Op::Slice(every_other), &[image]);

@@ -10,6 +10,7 @@ pub mod onnx_file;
 pub mod onnxruntime;
 pub mod project;
 pub mod random;
+pub mod random_graph;
 pub mod sketch;
 pub mod torch_file;
 pub mod trial;

@@ -6,8 +6,8 @@ use firmware::kernels::plan::max_pool_in_place;
 /// Operands whose memory the output may take over, if nothing else needs them; a max pool's only if `pooling`, the
 /// others only if `sums`.
 ///
-/// The kernels read such an operand element by element (attention, softmax: row by row; max pool: where the rule of the kernels
-/// holds) before they write there. An operand that the step reads twice is excluded.
+/// The kernels read such an operand element by element (attention, softmax: row by row; max pool: where the rule of
+/// the kernels holds) before they write there. An operand that the step reads twice is excluded.
 pub(super) fn overwritable(model: &QModel, op: &QOp, pooling: bool, sums: bool) -> Vec<QTensorId> {
     let output = model.tensor(op.output());
     let residual = |rescale: &QRescale| match rescale.residual {

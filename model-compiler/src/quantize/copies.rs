@@ -19,26 +19,29 @@ pub(super) fn use_counts(graph: &Graph) -> Vec<u32> {
     counts
 }
 
-/// Gives each copy the storage of its operand. Before that, an operand that only a concatenation reads gets the storage
-/// of the whole (its codes are then moved, not rescaled), and one that only a clip reads gets the storage of what the clip
-/// leaves, where the step that computes it will carry the bounds.
+/// Gives each copy the storage of its operand. Before that:
+/// * an operand that only a concatenation reads gets the storage of the whole: its codes are moved, not rescaled
+/// * an operand that only a clip reads gets the storage of what the clip leaves: its step will carry the bounds; what
+///   that step reads keeps storage of its own, for it is not within the bounds
 pub(super) fn share_storage(graph: &Graph, roles: &[Role], types: &mut [Stored]) {
     let uses = use_counts(graph);
-    let mut given = vec![false; types.len()];
+    let mut joined = vec![false; types.len()];
+    let mut clipped = vec![false; types.len()];
     for node in graph.nodes.iter().rev() {
-        let gives = |id: &ValueId| match node.op {
-            Op::Concat(_) => true,
-            Op::Clip(_) => graph.producer(*id).is_some_and(|producer| has_bounds(&producer.op)),
-            _ => is_copy(&node.op) && given[node.output.0 as usize],
-        };
-        let free = |id: &ValueId| {
-            let ordinary = matches!(roles[id.0 as usize], Role::Narrow | Role::Skip | Role::Vector);
-            ordinary && uses[id.0 as usize] == 1
-        };
-        let takers: Vec<ValueId> = node.inputs.iter().copied().filter(|id| free(id) && gives(id)).collect();
-        for id in takers {
-            types[id.0 as usize] = types[node.output.0 as usize];
-            given[id.0 as usize] = true;
+        let result = node.output.0 as usize;
+        for id in &node.inputs {
+            let operand = id.0 as usize;
+            let ordinary = matches!(roles[operand], Role::Narrow | Role::Skip | Role::Vector);
+            if !ordinary || uses[operand] != 1 {
+                continue;
+            }
+            match &node.op {
+                Op::Clip(_) if graph.producer(*id).is_some_and(|p| has_bounds(&p.op)) => clipped[operand] = true,
+                Op::Concat(_) if !clipped[result] => joined[operand] = true,
+                op if is_copy(op) && joined[result] => joined[operand] = true,
+                _ => continue,
+            }
+            types[operand] = types[result];
         }
     }
     for node in graph.nodes.iter().filter(|node| is_copy(&node.op)) {

@@ -12,7 +12,7 @@
 //! | GRU start state | i16, a power of two |
 //! | velocity, goal, waypoints | fixed point |
 //!
-//! Pools, slices and pads copy codes, so what they give is stored like what they read ([`super::copies`]).
+//! Pools, slices and pads copy codes, so what they give is stored like what they read (`copies`).
 
 use super::QuantizeOptions;
 use super::copies;
@@ -192,7 +192,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
             Op::ResizeBilinear { .. } if node.inputs.len() == 2 => Role::Skip,
             Op::GlobalPool => Role::Vector,
             Op::AveragePool(_) if graph.value(node.output).shape.positions() == 1 => Role::Vector,
-            Op::Concat(_) if (0..node.inputs.len()).any(|k| wide(k)) => Role::Vector,
+            Op::Concat(_) if (0..node.inputs.len()).any(wide) => Role::Vector,
             Op::Slice(_) | Op::Pad(_) | Op::Clip(_) if of(0) == Some(Role::Vector) => Role::Vector,
             Op::Softmax => Role::Probabilities,
             Op::WaypointDecoder(_) => Role::Waypoints,
