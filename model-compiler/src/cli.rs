@@ -120,7 +120,14 @@ pub struct ImportArgs {
     resolution: Option<Resolution>,
     /// Mean of an ONNX network's image, one value or one per channel: the network reads (grey level * SCALE - MEAN) /
     /// STD [default: ImageNet's 0.485,0.456,0.406 for RGB, 0 for grey].
-    #[arg(long, value_name = "R,G,B", value_delimiter = ',', value_parser = finite, allow_hyphen_values = true, requires = "std")]
+    #[arg(
+        long,
+        value_name = "R,G,B",
+        value_delimiter = ',',
+        value_parser = finite,
+        allow_hyphen_values = true,
+        requires = "std"
+    )]
     mean: Option<Vec<f64>>,
     /// Standard deviation, like --mean [default: ImageNet's 0.229,0.224,0.225 for RGB, 1 for grey].
     #[arg(long, value_name = "R,G,B", value_delimiter = ',', value_parser = positive, requires = "mean")]

@@ -1,4 +1,4 @@
-//! From a checkpoint's tensors to the float graph.
+//! From a file to the float graph: a checkpoint's tensors, or an ONNX model ([`onnx`]).
 //!
 //! The readers ([`checkpoint`]) give [`NamedTensors`]; the system is told from the names; every size of the network
 //! (channels, blocks, fusion scales, transformer layers, hidden sizes) from the shapes; the graph that comes out stays

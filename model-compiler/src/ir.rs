@@ -44,7 +44,7 @@ pub struct Value {
 /// What a graph input holds, in raw units.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub enum InputKind {
-    /// RGB image, values 0..=255.
+    /// RGB or grey image, values 0..=255.
     Image,
     /// LiDAR histogram: counts 0..=5; the network sees counts / 5.
     Bev,

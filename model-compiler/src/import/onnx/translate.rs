@@ -116,7 +116,7 @@ impl<'a> Translator<'a> {
         let known = |name: &str| {
             self.values.contains_key(name) || self.unknown.contains(name) || self.model.initializers.contains_key(name)
         };
-        for name in node.inputs.iter().filter(|name| !name.is_empty() && !known(name)) {
+        if let Some(name) = node.inputs.iter().find(|name| !name.is_empty() && !known(name)) {
             let message = match writers.get(name.as_str()) {
                 Some(later) => {
                     let place = Node::new(later, node.opset).map_or(String::new(), |n| n.place());
