@@ -164,3 +164,59 @@ impl<'a> Reader<'a> {
         self.sums.into_iter().map(covariance).collect()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::{QuantizeOptions, types};
+    use super::*;
+    use crate::calibrate::calibrate;
+    use crate::ir::{Clip, InputKind, Weights};
+    use std::sync::Arc;
+
+    /// A convolution of two taps, padded on the left, over a map of one row and `width` columns.
+    fn graph(width: u16) -> Graph {
+        let mut graph = Graph::default();
+        let x = graph.push_input("x", InputKind::Image, Shape::map(1, width, 1));
+        let window = Window { kernel_w: 2, pad_left: 1, pad_right: 0, ..Window::square(1, 1, 0) };
+        let conv = Conv2d {
+            weights: Arc::new(Weights { shape: vec![1, 1, 2, 1], data: vec![0.3, -1.0] }),
+            bias: None,
+            window,
+            groups: 1,
+            normalization: None,
+            clip: Clip::NONE,
+        };
+        let y = graph.push("y", Op::Conv2d(conv), &[x]).unwrap();
+        graph.outputs = vec![y];
+        graph
+    }
+
+    fn measured(graph: &Graph, frames: &[Vec<Vec<f32>>]) -> Covariances {
+        let statistics = calibrate(graph, frames, |_, _| {}).unwrap();
+        let types = types::assign(graph, &statistics, &QuantizeOptions::default()).unwrap();
+        Covariances::measure(graph, frames, &types).unwrap()
+    }
+
+    #[test]
+    fn windows_of_all_frames_count_with_their_padding() {
+        // Windows (0, 10), (10, 30) and (0, 50), (50, 20); as often again, to have samples enough.
+        let frame = |a: f32, b: f32| vec![vec![a, b]];
+        let frames: Vec<_> = [frame(10.0, 30.0), frame(50.0, 20.0)].into_iter().cycle().take(16).collect();
+        let graph = graph(2);
+        let found = measured(&graph, &frames);
+        let windows = [[0.0, 10.0], [10.0, 30.0], [0.0, 50.0], [50.0, 20.0]];
+        let mean = |f: &dyn Fn(&[f64; 2]) -> f64| windows.iter().map(f).sum::<f64>() / 4.0;
+        let matrix = &found.of(graph.outputs[0]).unwrap()[0];
+        for ((i, j), &value) in matrix.indexed_iter() {
+            let expected = mean(&|w| w[i] * w[j]) - mean(&|w| w[i]) * mean(&|w| w[j]);
+            assert!((value - expected).abs() < 1e-9, "{i}, {j}: {value}, expected {expected}");
+        }
+    }
+
+    #[test]
+    fn a_layer_of_few_samples_is_left_alone() {
+        let (narrow, wide) = (graph(2), graph(16));
+        assert!(measured(&narrow, &vec![vec![vec![1.0, 2.0]]; 7]).of(narrow.outputs[0]).is_none());
+        assert!(measured(&wide, &[vec![vec![3.0; 16]]]).of(wide.outputs[0]).is_some());
+    }
+}
