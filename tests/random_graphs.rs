@@ -85,5 +85,5 @@ fn random_networks_are_byte_exact_and_close_to_f32() {
         }
     }
     println!("{NETWORKS} networks, steps {steps:?}: at least {worst_local:.1} dB per step, {worst:.1} dB in all");
-    assert!(OPERATORS.iter().all(|operator| steps.contains_key(operator)), "{steps:?}");
+    assert!(OPERATORS.iter().all(|operator| steps.contains_key(*operator)), "{steps:?}");
 }
