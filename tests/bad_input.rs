@@ -555,7 +555,7 @@ fn words_of_the_command_line_that_mean_nothing() {
     refused(
         &folder,
         "host-sim verify @net.img --inputs @inputs.safetensors --min-sqnr 3",
-        "--min-sqnr: needs the f32 network to compare with\n  help: add --model MODEL",
+        "gate min_sqnr_db (--min-sqnr): needs the f32 network to compare with\n  help: add --model MODEL",
     );
     let (status, document) = folder.json("host-sim run @net.img --json");
     assert_eq!(

@@ -4,6 +4,7 @@ use firmware::engine::Engine;
 use firmware::image::Image;
 use firmware::kernels::Portable;
 use host_sim::backends::Backend;
+use host_sim::buffers::GuardedArena;
 use host_sim::run::ModelInfo;
 use host_sim::verify::{Sources, compare};
 use indicatif::ProgressBar;
@@ -33,8 +34,8 @@ fn assert_byte_exact(compiled: &Compiled, frames: &[Frame], backend: Backend) {
 fn assert_self_test_passes(compiled: &Compiled) {
     let bytes = AlignedBytes::from(compiled.image.as_slice());
     let image = Image::parse(&bytes).unwrap_or_else(|e| panic!("{e}"));
-    let mut arena = AlignedBytes::zeroed(image.arena_bytes() as usize);
-    let mut engine = Engine::new(image, Portable, &mut arena).unwrap_or_else(|e| panic!("{e}"));
+    let mut arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
+    let mut engine = Engine::new(image, Portable, arena.poisoned(0)).unwrap_or_else(|e| panic!("{e}"));
     engine.self_test().unwrap_or_else(|e| panic!("{e}"));
 }
 
