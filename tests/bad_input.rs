@@ -210,7 +210,7 @@ fn checkpoints_that_are_attacks_or_no_checkpoints() {
     refused(
         &folder,
         quantize,
-        "@bad.pth: byte 0: found an empty file, expected a torch zip archive (PK), a torch legacy stream (a pickle) or safetensors\n  help: save the weights with torch.save(model.state_dict(), FILE) or safetensors, and check that the download is complete",
+        "@bad.pth: byte 0: found an empty file, expected a torch zip archive (PK), a torch legacy stream (a pickle), safetensors or ONNX\n  help: save the weights with torch.save(model.state_dict(), FILE) or safetensors, and check that the download is complete",
     );
     let whole = folder.read("net.safetensors");
     folder.write("bad.pth", &whole[..whole.len() - 1]);
@@ -229,7 +229,7 @@ fn checkpoints_that_are_attacks_or_no_checkpoints() {
     refused(
         &folder,
         quantize,
-        "@bad.pth: byte 0: found a file that begins with \"\\x93DRIVE\\r\\n\", expected a torch zip archive (PK), a torch legacy stream (a pickle) or safetensors\n  help: save the weights with torch.save(model.state_dict(), FILE) or safetensors, and check that the download is complete",
+        "@bad.pth: byte 0: found a file that begins with \"\\x93DRIVE\\r\\n\", expected a torch zip archive (PK), a torch legacy stream (a pickle), safetensors or ONNX\n  help: save the weights with torch.save(model.state_dict(), FILE) or safetensors, and check that the download is complete",
     );
     folder.write("bad.pth", folder.read("net.qmodel"));
     refused(
@@ -245,7 +245,7 @@ fn calibration_that_is_missing() {
     refused(
         &folder,
         "model-compiler compile @net.safetensors -o @new.img",
-        "@net.safetensors: a checkpoint needs calibration frames\n  help: add --calib FRAMES (a frame directory or a .safetensors file of raw inputs)",
+        "@net.safetensors: this model needs calibration frames\n  help: add --calib FRAMES (a frame directory or a .safetensors file of raw inputs)",
     );
     std::fs::create_dir(folder.path("frames")).unwrap();
     refused(
@@ -423,7 +423,7 @@ fn quantized_models_and_records_that_are_damaged() {
     refused(
         &folder,
         compile,
-        "@bad.qmodel: byte 0: found a file that begins with \"QMODE\", expected a torch zip archive (PK), a torch legacy stream (a pickle) or safetensors\n  help: save the weights with torch.save(model.state_dict(), FILE) or safetensors, and check that the download is complete",
+        "@bad.qmodel: byte 0: found a file that begins with \"QMODE\", expected a torch zip archive (PK), a torch legacy stream (a pickle), safetensors or ONNX\n  help: save the weights with torch.save(model.state_dict(), FILE) or safetensors, and check that the download is complete",
     );
     let verify = "host-sim verify @net.img --inputs @inputs.safetensors --record @bad.record";
     refused(
@@ -555,7 +555,7 @@ fn words_of_the_command_line_that_mean_nothing() {
     refused(
         &folder,
         "host-sim verify @net.img --inputs @inputs.safetensors --min-sqnr 3",
-        "--min-sqnr: needs the f32 network to compare with\n  help: add --model MODEL",
+        "gate min_sqnr_db (--min-sqnr): needs the f32 network to compare with\n  help: add --model MODEL",
     );
     let (status, document) = folder.json("host-sim run @net.img --json");
     assert_eq!(

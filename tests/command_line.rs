@@ -115,8 +115,12 @@ fn verify_shows_every_step_and_gates_its_noise() {
          inputs#2, inputs#3\n"
     );
     let missed = folder.run(&format!("{command} --min-sqnr 90"));
-    assert_eq!((missed.status, missed.out == outcome.out), (1, true), "the report is printed all the same");
-    assert_holds(&missed.err, &["\nerror: step ", "the gate asks for 90 dB"]);
+    let table = |out: &str| out.lines().filter(|line| !line.starts_with("gate ")).collect::<Vec<_>>().join("\n");
+    let same = table(&missed.out) == table(&outcome.out);
+    assert_eq!((missed.status, same), (1, true), "the report is printed all the same");
+    assert_holds(&outcome.out, &["gate min_sqnr_db met"]);
+    assert_holds(&missed.out, &["gate min_sqnr_db MISSED"]);
+    assert_holds(&missed.err, &["\nerror: gate min_sqnr_db: step ", "expected at least 90 dB"]);
     let (status, document) = folder.json(&format!("{command} --min-sqnr 90 --json"));
     assert_eq!((status, &document["passed"], &document["bytes_equal"]), (1, &false.into(), &true.into()));
     assert_eq!((&document["error"]["code"], &document["schema"]), (&"check".into(), &1.into()));
@@ -232,4 +236,36 @@ fn help_and_version_are_results() {
         &["--calib", "--target", "--ram", "--no-in-place-pooling"],
     );
     assert_holds(&folder.ok("host-sim verify --help"), &["--min-sqnr", "--mirror", "--record", "--json"]);
+    assert_holds(&folder.ok("host-sim bench --help"), &["--rounds", "--backend", "avx512-vnni", "taskset"]);
+}
+
+#[test]
+fn every_shell_gets_a_script_that_knows_the_commands() {
+    let folder = Folder::default();
+    for shell in ["bash", "elvish", "fish", "powershell", "zsh"] {
+        let script = folder.ok(&format!("model-compiler completions {shell}"));
+        assert_holds(&script, &["model-compiler", "quantize", "calib", "no-in-place-pooling"]);
+        let script = folder.ok(&format!("host-sim completions {shell}"));
+        assert_holds(&script, &["host-sim", "verify", "min-sqnr", "bench"]);
+    }
+    for program in ["model-compiler", "host-sim"] {
+        let outcome = folder.run(&format!("{program} completions tcl"));
+        assert_eq!((outcome.status, outcome.out.as_str()), (2, ""));
+        assert_holds(&outcome.err, &["invalid value 'tcl'", "powershell"]);
+    }
+}
+
+#[test]
+fn what_was_meant_is_suggested() {
+    let folder = Folder::default();
+    for (command, meant) in [
+        ("model-compiler inspcet @net.img", "'inspect'"),
+        ("model-compiler compile @net.qmodel --tagret cortex-m7 -o @net.img", "'--target'"),
+        ("host-sim verfy @net.img", "'verify'"),
+        ("host-sim run @net.img --frame @frames", "'--frames'"),
+    ] {
+        let outcome = folder.run(command);
+        assert_eq!((outcome.status, outcome.out.as_str()), (2, ""), "{command}");
+        assert!(outcome.err.contains("similar") && outcome.err.contains(meant), "{command}: {}", outcome.err);
+    }
 }

@@ -53,6 +53,14 @@ fn the_demo_runs_verifies_every_byte_and_leaves_its_files() {
     assert!(text.contains(out.to_str().unwrap()), "says where the files lie:\n{text}");
     let report: serde_json::Value = serde_json::from_slice(&std::fs::read(out.join("report.json")).unwrap()).unwrap();
     assert_eq!((&report["bytes_equal"], &report["untrained"]), (&true.into(), &true.into()));
+    assert!(report["noise"]["shares"].as_array().unwrap().len() > 100, "{}", report["noise"]);
+    let page = std::fs::read_to_string(out.join("report.html")).unwrap();
+    for expected in
+        ["Untrained network", "✓ Passed", "Where the noise comes from", "scene-3 (mirrored)", "data:image/png"]
+    {
+        assert!(page.contains(expected), "{expected}");
+    }
+    assert!(page.len() < 3_000_000 && !page.contains("http"), "{} B", page.len());
     assert_eq!(report["frames"].as_array().unwrap().len(), 6, "three frames and their mirror images");
     assert_eq!(report["calibration_frames"], serde_json::json!([]), "evaluation frames are not calibration frames");
     for step in report["steps"].as_array().unwrap() {

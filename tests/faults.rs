@@ -27,7 +27,7 @@ fn expected_operators(fault: Fault) -> &'static [&'static str] {
         Fault::GateOrder | Fault::ResetBeforeBias | Fault::TanhNextEntry | Fault::GoalFirstStepOnly => {
             &["waypoint_decoder"]
         }
-        Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention"],
+        Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention", "softmax"],
         Fault::LayerNormEpsilon => &["layer_norm"],
         Fault::DepthTail | Fault::MultiplierPlusOne | Fault::ChannelsSwapped => WEIGHTED,
         // Where the bytes in front of the scratch belong to an operand of the same step, the engine refuses to cut
@@ -37,6 +37,8 @@ fn expected_operators(fault: Fault) -> &'static [&'static str] {
         Fault::TokenOrder => &["tokens"],
         Fault::MaxPoolPadding => &["max_pool"],
         Fault::PoolSecondMap => &["global_pool"],
+        Fault::BoxOffset | Fault::BorderZero => &["copy_box"],
+        Fault::ConcatOrder => &["concat"],
     }
 }
 
@@ -109,7 +111,14 @@ impl Subject {
     /// `host-sim verify IMAGE --inputs FILE --json`.
     fn verify(&self) -> Outcome {
         let arguments = ["host-sim".into(), "verify".into(), self.image.clone().into_os_string()];
-        let inputs: [OsString; 3] = ["--inputs".into(), self.inputs.clone().into_os_string(), "--json".into()];
+        let inputs: [OsString; 5] = [
+            "--inputs".into(),
+            self.inputs.clone().into_os_string(),
+            "--json".into(),
+            // The others have no faults.
+            "--backend".into(),
+            "portable".into(),
+        ];
         let (mut out, mut err) = (Vec::new(), Vec::new());
         let status = cli::main(arguments.into_iter().chain(inputs), Console { out: &mut out, err: &mut err });
         let document: Value = serde_json::from_slice(&out).expect("a JSON document");

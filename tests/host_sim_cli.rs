@@ -79,7 +79,7 @@ fn a_missed_gate_is_exit_status_one_and_names_the_step() {
     let outcome = project.host_sim(command);
     assert_eq!(outcome.status, 1);
     assert!(
-        outcome.err.contains("error: step ") && outcome.err.contains("the gate asks for 200 dB"),
+        outcome.err.contains("error: gate min_sqnr_db: step ") && outcome.err.contains("expected at least 200 dB"),
         "{}",
         outcome.err
     );

@@ -8,7 +8,7 @@ use tests::project::Project;
 #[test]
 fn verify_catches_an_engine_with_a_fault() {
     let project = Project::new(System::TransFuser);
-    let command = "verify net.img --inputs inputs.safetensors";
+    let command = "verify net.img --inputs inputs.safetensors --backend portable";
     assert_eq!(project.host_sim(command).status, 0);
     let cases = [
         ("DepthTail", "conv2d"),

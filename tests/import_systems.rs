@@ -3,7 +3,7 @@
 use model_compiler::error::ErrorCode;
 use model_compiler::import::{ImportOptions, NamedTensor, NamedTensors, System, TensorData, import};
 use model_compiler::ir::verify::verify;
-use model_compiler::ir::{Graph, InputKind, Op, Shape};
+use model_compiler::ir::{Clip, Graph, InputKind, Op, Shape};
 use model_compiler::passes::{PassOptions, optimize, optimize_with};
 use tests::golden::{self, Network};
 
@@ -171,7 +171,7 @@ fn optimized_transfuser_consists_of_fused_operators() {
     }
     assert_eq!(graph.values.len(), graph.nodes.len(), "no dead values");
     let block = graph.producer(graph.find("encoder.image_encoder.features.layer2.0").unwrap()).unwrap();
-    assert!(matches!(&block.op, Op::Conv2d(c) if c.relu && c.window.kernel_h == 3));
+    assert!(matches!(&block.op, Op::Conv2d(c) if c.clip == Clip::RELU && c.window.kernel_h == 3));
     assert_eq!(graph.value(block.inputs[1]).name, "encoder.image_encoder.features.layer2.0.downsample.1");
     let normalized = |name: &str| match &graph.producer(graph.find(name).unwrap()).unwrap().op {
         Op::Conv2d(conv) => conv.normalization.clone(),
@@ -257,7 +257,7 @@ fn surplus_counters_are_no_problem_and_other_leftovers_are() {
 #[test]
 fn unfitting_options_are_refused_by_name() {
     let tensors = Network::small(System::TransFuser).tensors();
-    let heads = ImportOptions { heads: 3, ..Default::default() };
+    let heads = ImportOptions { heads: Some(3), ..Default::default() };
     let error = import("m", tensors.clone(), &heads).unwrap_err();
     assert_eq!(
         error.to_string(),

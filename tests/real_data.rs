@@ -70,3 +70,30 @@ fn a_published_checkpoint_is_listed() {
         outcome.err
     );
 }
+
+/// A published ResNet-20, calibrated on 500 training images: classes and logits of 500 test images against f32.
+#[test]
+fn a_published_classifier_keeps_its_logits() {
+    let (Some(model), Some(calibration), Some(test)) = (
+        commands::shared("data/models/resnet20-12fca82f.onnx"),
+        commands::shared("data/cifar10/calibration"),
+        commands::shared("data/cifar10/test"),
+    ) else {
+        return;
+    };
+    let folder = Folder::default();
+    let (model, calibration, test) = (model.display(), calibration.display(), test.display());
+    folder.ok(&format!("model-compiler compile {model} --calib {calibration} --target cortex-m4 -o @resnet20.img"));
+    let (status, report) =
+        folder.json(&format!("host-sim verify @resnet20.img --model {model} --frames {test} --json"));
+    assert_eq!((status, &report["bytes_equal"]), (0, &true.into()), "{}", report["first_difference"]);
+    let found = &report["summary"]["accuracy"];
+    println!("{found:#}");
+    let figure = |value: &Value| value.as_f64().expect("a figure");
+    assert_eq!(found["int8"]["frames"], 500);
+    assert!(figure(&found["f32"]["top1"]) >= 0.909);
+    assert!(figure(&found["int8"]["top1"]) >= 0.905);
+    assert!(figure(&found["agreement"]["share"]) >= 0.985);
+    assert!(figure(&found["logits_sqnr_db"]) >= 34.0);
+    assert!(report["summary"]["arena_bytes"].as_u64() <= Some(34_000));
+}

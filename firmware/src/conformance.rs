@@ -82,7 +82,7 @@ struct Difference {
 }
 
 /// Every operator of the image format.
-const OPERATORS: [Operator; 12] = [
+const OPERATORS: [Operator; 15] = [
     Operator { name: "conv2d", cases: 3000, run: weighted::conv2d },
     Operator { name: "linear", cases: 3000, run: weighted::linear },
     Operator { name: "max_pool", cases: 1000, run: maps::max_pool },
@@ -95,6 +95,9 @@ const OPERATORS: [Operator; 12] = [
     Operator { name: "layer_norm", cases: 1000, run: tokens::layer_norm },
     Operator { name: "attention", cases: 600, run: tokens::attention },
     Operator { name: "waypoint_decoder", cases: 300, run: tokens::waypoint_decoder },
+    Operator { name: "copy_box", cases: 600, run: maps::copy_box },
+    Operator { name: "concat", cases: 600, run: maps::concat },
+    Operator { name: "softmax", cases: 600, run: tokens::softmax },
 ];
 
 /// Compares a backend with [`Portable`]. `workspace`: [`WORKSPACE_BYTES`]; what does not fit in a smaller one is left out

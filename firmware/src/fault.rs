@@ -1,6 +1,7 @@
 //! Named faults for tests: under the feature `fault-injection` one wrong behavior at a time can be switched on, to prove
 //! that the byte-for-byte comparison and the validation suite would catch it. Without the feature every query is the
-//! constant `false` and disappears.
+//! constant `false` and disappears. Of the kernels only the portable ones have faults: a query in the inner loop of
+//! another backend would keep the compiler from forming vectors.
 
 /// A wrong behavior; the name says what is done wrong.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,7 +42,7 @@ pub enum Fault {
     MultiplierPlusOne,
     /// The weights of output channels 0 and 1 are swapped.
     ChannelsSwapped,
-    /// The softmax maximum skips the last key.
+    /// The softmax maximum skips the last key (of attention) or channel.
     SoftmaxMaximum,
     /// Resize uses the weights of its two rows the wrong way round.
     ResizeWeights,
@@ -53,11 +54,17 @@ pub enum Fault {
     PoolSecondMap,
     /// The goal is not added to (or concatenated with) the waypoint after the first step.
     GoalFirstStepOnly,
+    /// A box is copied from one element too far along the innermost axis that has room for it.
+    BoxOffset,
+    /// The border around a box is code 0 instead of its own.
+    BorderZero,
+    /// The operands of a concatenation are exchanged.
+    ConcatOrder,
 }
 
 impl Fault {
     /// All faults, for tests and `--fault NAME`.
-    pub const ALL: [Fault; 23] = [
+    pub const ALL: [Fault; 26] = [
         Self::TieDown,
         Self::TieAwayFromZero,
         Self::DoubleRounding,
@@ -81,6 +88,9 @@ impl Fault {
         Self::MaxPoolPadding,
         Self::PoolSecondMap,
         Self::GoalFirstStepOnly,
+        Self::BoxOffset,
+        Self::BorderZero,
+        Self::ConcatOrder,
     ];
 }
 

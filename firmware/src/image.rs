@@ -55,6 +55,7 @@
     clippy::panic
 )]
 
+use crate::ops::{self, StepContext};
 use crate::program::{ConstRange, Step};
 use crate::tensor::{TensorId, index};
 use bytemuck::Pod;
@@ -219,6 +220,11 @@ impl<'a> Image<'a> {
     /// by the others.
     pub fn work(&self) -> u64 {
         self.work
+    }
+
+    /// The part of [`Self::work`] that one step does; `None` behind the last.
+    pub fn step_work(&self, position: u16) -> Option<u64> {
+        ops::validate(&self.step(position)?, &StepContext { image: self, position }).ok()
     }
 
     /// An input, in header order; `None` behind the last.

@@ -6,7 +6,7 @@
 //! infallible: `Image::parse` has proved shapes, lengths and alignment, and all arithmetic is total (hostile constants
 //! give wrong numbers, never a panic).
 
-use crate::program::{Clamp, KernelId, Requant, Window};
+use crate::program::{Axis, Clamp, KernelId, Requant, Window};
 use crate::tensor::{Codes, CodesMut, Shape};
 
 pub mod k4n16;
@@ -249,6 +249,47 @@ pub struct WaypointDecoderArgs<'a> {
     pub tanh_table: &'a [i16],
 }
 
+/// Arguments of [`Kernels::copy_box`]; see [`crate::program::CopyBox`].
+#[derive(Clone, Copy, Debug)]
+pub struct CopyBoxArgs {
+    /// Input shape.
+    pub input_shape: Shape,
+    /// Output shape.
+    pub output_shape: Shape,
+    /// First index of the input per axis.
+    pub begin: [u16; 3],
+    /// Distance of neighbors in the input per axis.
+    pub stride: [u16; 3],
+    /// Elements taken per axis.
+    pub size: [u16; 3],
+    /// Border in front of them per axis.
+    pub before: [u16; 3],
+    /// Code of the border.
+    pub border: i16,
+}
+
+/// One operand of [`Kernels::concat`].
+#[derive(Clone, Copy, Debug)]
+pub struct ConcatSourceArgs<'a> {
+    /// Codes of the map.
+    pub codes: Codes<'a>,
+    /// Shape of the map.
+    pub shape: Shape,
+    /// To the output's scale, with the output's zero point and bounds.
+    pub requant: RequantArgs,
+}
+
+/// Arguments of [`Kernels::softmax`].
+#[derive(Clone, Copy, Debug)]
+pub struct SoftmaxArgs<'a> {
+    /// Values of one softmax.
+    pub channels: u16,
+    /// `M_u`, `n_u`.
+    pub exponent: Requant,
+    /// 257 entries.
+    pub exp_table: &'a [i16],
+}
+
 /// One method per operator; see the module page. Operand layouts are those of [`crate::tensor`].
 pub trait Kernels {
     /// The kernels that this backend can read.
@@ -330,6 +371,21 @@ pub trait Kernels {
     ) {
         portable::waypoint_decoder::waypoint_decoder(args, hidden, goal, waypoints, scratch);
     }
+
+    /// A strided box of the input inside a border.
+    fn copy_box(&self, args: &CopyBoxArgs, input: Codes<'_>, output: CodesMut<'_>) {
+        portable::copy_box::copy_box(args, input, output);
+    }
+
+    /// Two maps one behind the other along an axis.
+    fn concat(&self, axis: Axis, sources: &[ConcatSourceArgs<'_>; 2], output: CodesMut<'_>) {
+        portable::concat::concat(axis, sources, output);
+    }
+
+    /// Softmax over the channels of each position. `input` is `None` in place: then `output` holds the logits.
+    fn softmax(&self, args: &SoftmaxArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
+        portable::softmax::softmax(args, input, output);
+    }
 }
 
 /// A borrowed backend is one: every method goes to the backend behind the reference.
@@ -399,6 +455,18 @@ impl<K: Kernels + ?Sized> Kernels for &K {
         scratch: &mut [u8],
     ) {
         (**self).waypoint_decoder(args, hidden, goal, waypoints, scratch);
+    }
+
+    fn copy_box(&self, args: &CopyBoxArgs, input: Codes<'_>, output: CodesMut<'_>) {
+        (**self).copy_box(args, input, output);
+    }
+
+    fn concat(&self, axis: Axis, sources: &[ConcatSourceArgs<'_>; 2], output: CodesMut<'_>) {
+        (**self).concat(axis, sources, output);
+    }
+
+    fn softmax(&self, args: &SoftmaxArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
+        (**self).softmax(args, input, output);
     }
 }
 

@@ -26,8 +26,10 @@ use crate::program::Step;
 mod add;
 mod attention;
 mod average_pool;
+mod concat;
 mod context;
 mod conv2d;
+mod copy_box;
 mod global_pool;
 mod layer_norm;
 mod linear;
@@ -35,6 +37,7 @@ mod max_pool;
 mod requantize;
 mod rescale;
 mod resize_bilinear;
+mod softmax;
 mod term;
 mod tokens;
 mod waypoint_decoder;
@@ -57,6 +60,9 @@ pub(crate) fn validate(step: &Step, context: &StepContext<'_, '_>) -> Result<u64
         Step::LayerNorm(step) => layer_norm::validate(step, context),
         Step::Attention(step) => attention::validate(step, context),
         Step::WaypointDecoder(step) => waypoint_decoder::validate(step, context),
+        Step::CopyBox(step) => copy_box::validate(step, context),
+        Step::Concat(step) => concat::validate(step, context),
+        Step::Softmax(step) => softmax::validate(step, context),
     }
 }
 
@@ -85,6 +91,9 @@ pub(crate) fn run<K: Kernels>(
         Step::LayerNorm(step) => layer_norm::run(step, &context, kernels, operands),
         Step::Attention(step) => attention::run(step, &context, kernels, operands),
         Step::WaypointDecoder(step) => waypoint_decoder::run(step, &context, kernels, operands),
+        Step::CopyBox(step) => copy_box::run(step, &context, kernels, operands),
+        Step::Concat(step) => concat::run(step, &context, kernels, operands),
+        Step::Softmax(step) => softmax::run(step, &context, kernels, operands),
     }
 }
 

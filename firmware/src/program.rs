@@ -15,7 +15,7 @@
     clippy::panic
 )]
 
-use crate::tensor::TensorId;
+use crate::tensor::{Shape, TensorId};
 use serde::{Deserialize, Serialize};
 
 /// A byte range of the constants section, 16-byte aligned, little-endian elements.
@@ -483,6 +483,96 @@ pub struct WaypointDecoder {
     pub scratch: Option<TensorId>,
 }
 
+/// A strided box of the input inside a border of one code, along height, width and channels:
+/// `y[before + i] = q[begin + i·stride]` for i in `0..size`, every other element of the output is the border.
+///
+/// A slice has no border, a pad takes the whole input. Input and output have the same type, scale and zero point.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct CopyBox {
+    /// i8 or i16 map.
+    pub input: TensorId,
+    /// Map of the same type.
+    pub output: TensorId,
+    /// First index of the input per axis.
+    pub begin: [u16; 3],
+    /// Distance of neighbors in the input per axis, at least 1.
+    pub stride: [u16; 3],
+    /// Elements taken per axis, at least 1.
+    pub size: [u16; 3],
+    /// Elements of border in front of them per axis; what the output is longer lies behind.
+    pub before: [u16; 3],
+    /// Code of the border.
+    pub border: i16,
+}
+
+/// An axis of a map.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Axis {
+    /// Rows.
+    Height,
+    /// Columns.
+    Width,
+    /// Channels.
+    Channels,
+}
+
+impl Axis {
+    /// Elements of a map that lie together in the map and in every concatenation along this axis.
+    pub const fn run(self, shape: Shape) -> u64 {
+        match self {
+            Self::Height => shape.elements(),
+            Self::Width => (shape.width as u64).saturating_mul(shape.channels as u64),
+            Self::Channels => shape.channels as u64,
+        }
+    }
+}
+
+/// One operand of a [`Concat`], brought to the output's scale.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct ConcatSource {
+    /// i8 or i16 map.
+    pub tensor: TensorId,
+    /// `z` of the operand.
+    pub zero_point: i16,
+    /// `M = s_x / s_o` and n; `2^23` and 23 where the scales are equal.
+    pub requant: Requant,
+}
+
+/// Two maps one behind the other along an axis, equal in the other two.
+///
+/// `y = clamp(z_o + R((q − z)·M, n))`, each operand with its own z, M and n.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Concat {
+    /// The operand in front.
+    pub first: ConcatSource,
+    /// The operand behind it.
+    pub second: ConcatSource,
+    /// i8 or i16 map.
+    pub output: TensorId,
+    /// Where the maps meet.
+    pub axis: Axis,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
+/// Softmax over the channels of each position; steps 2 and 3 of [`crate::ops`] with `δ_j = max(q) − q_j`, then
+/// `p_j = min(32767, R(e_j·R_s, c+7))` (Q15).
+///
+/// At most 32768 channels: then `S < 2^30`, so that `2^(c+22) ≤ 2^52`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Softmax {
+    /// i8 or i16; the zero point does not matter.
+    pub input: TensorId,
+    /// i16, same shape, scale `2^-15`. May overwrite an i16 input: an element is written after its last use.
+    pub output: TensorId,
+    /// `M_u`, `n_u`, of `s_x·log2(e)·2^16`.
+    pub exponent: Requant,
+    /// 257 × `i16`: `T[k] = min(32767, round(2^15·2^(−k/256)))`.
+    pub exp_table: ConstRange,
+}
+
 /// One operator of the program, in the order of execution.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant, reason = "decoded one at a time on the stack, never stored in bulk on the target")]
@@ -500,6 +590,9 @@ pub enum Step {
     LayerNorm(LayerNorm),
     Attention(Attention),
     WaypointDecoder(WaypointDecoder),
+    CopyBox(CopyBox),
+    Concat(Concat),
+    Softmax(Softmax),
 }
 
 impl Rescale {
@@ -514,7 +607,7 @@ impl Rescale {
 
 impl Step {
     /// Union of the feature bits of all step kinds and kernels of this format.
-    pub const KNOWN_FEATURES: u64 = ((1 << 12) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
+    pub const KNOWN_FEATURES: u64 = ((1 << 15) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
 
     /// Operator name as reports print it.
     pub const fn name(&self) -> &'static str {
@@ -531,6 +624,9 @@ impl Step {
             Self::LayerNorm(_) => "layer_norm",
             Self::Attention(_) => "attention",
             Self::WaypointDecoder(_) => "waypoint_decoder",
+            Self::CopyBox(_) => "copy_box",
+            Self::Concat(_) => "concat",
+            Self::Softmax(_) => "softmax",
         }
     }
 
@@ -549,6 +645,9 @@ impl Step {
             Self::LayerNorm(_) => 9,
             Self::Attention(_) => 10,
             Self::WaypointDecoder(_) => 11,
+            Self::CopyBox(_) => 12,
+            Self::Concat(_) => 13,
+            Self::Softmax(_) => 14,
         }
     }
 
@@ -567,6 +666,9 @@ impl Step {
             Self::LayerNorm(s) => s.output,
             Self::Attention(s) => s.output,
             Self::WaypointDecoder(s) => s.output,
+            Self::CopyBox(s) => s.output,
+            Self::Concat(s) => s.output,
+            Self::Softmax(s) => s.output,
         }
     }
 
@@ -605,6 +707,9 @@ impl Step {
             Self::LayerNorm(s) => [Some(s.input), None, None],
             Self::Attention(s) => [Some(s.query), Some(s.key), Some(s.value)],
             Self::WaypointDecoder(s) => [Some(s.hidden), Some(s.goal), None],
+            Self::CopyBox(s) => [Some(s.input), None, None],
+            Self::Concat(s) => [Some(s.first.tensor), Some(s.second.tensor), None],
+            Self::Softmax(s) => [Some(s.input), None, None],
         }
     }
 
@@ -618,6 +723,7 @@ impl Step {
             Self::Add(s) => [Some(s.first.tensor), Some(s.second.tensor)],
             Self::ResizeBilinear(s) => [s.residual.map(|term| term.tensor), None],
             Self::Attention(s) => [Some(s.query), None],
+            Self::Softmax(s) => [Some(s.input), None],
             _ => [None, None],
         }
     }

@@ -2,13 +2,14 @@
 //!
 //! The f64 model stands for the engine, since their bytes are equal; nothing has to be compiled.
 
+use crate::classification::{ClassificationSummary, Comparison};
 use crate::files::FrameSource;
 use crate::statistics::{ErrorSums, Spread};
 use crate::trace::input_codes;
 use indicatif::ProgressBar;
 use model_compiler::calibrate::{Statistics, calibrate};
 use model_compiler::error::{Error, ErrorCode, Result};
-use model_compiler::frames::{Frame, FrameFormat};
+use model_compiler::frames::{self, Frame, FrameFormat};
 use model_compiler::import::ImportOptions;
 use model_compiler::integer_reference;
 use model_compiler::ir::{Graph, Op};
@@ -34,12 +35,15 @@ pub struct Variant {
 /// What a variant reaches over all evaluation frames.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fidelity {
-    /// SQNR of the pooled global vector, dB: power sums over all frames.
+    /// SQNR of the pooled global vector (of the first output where nothing is pooled), dB: power sums over all frames.
     pub vector_sqnr_db: f64,
     /// Mean distance from the f32 waypoint, per waypoint, millimeters.
     pub mean_mm: Vec<f64>,
     /// Largest distance, per waypoint, millimeters.
     pub worst_mm: Vec<f64>,
+    /// Of a classifier: SQNR of the logits, agreement with f32, accuracy.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub classes: Option<ClassificationSummary>,
 }
 
 /// The default with 8-bit and with 16-bit skip values, and the former without one choice each.
@@ -58,7 +62,8 @@ pub fn variants() -> Vec<Variant> {
             passes: PassOptions { fuse_residual: false },
         },
         variant("without MSE ranges", QuantizeOptions { ranges: RangeRule::MinMax, ..base.clone() }),
-        variant("without bias correction", QuantizeOptions { bias_correction: false, ..base }),
+        variant("without bias correction", QuantizeOptions { bias_correction: false, ..base.clone() }),
+        variant("without data-aware rounding", QuantizeOptions { data_aware_rounding: false, ..base }),
     ]
 }
 
@@ -94,12 +99,14 @@ pub fn ablate(options: &Options, progress: &ProgressBar) -> Result<Vec<Row>> {
     let variants = variants();
     let graph = |passes| pipeline::load_graph(&options.model, &options.import, &passes);
     let fused = graph(PassOptions::default())?;
-    let calibration = pipeline::load_frames(&fused, &options.calib)?;
+    let format = FrameFormat { resize: options.frames.selection.resize.resize, ..FrameFormat::of_graph(&fused) };
+    let calibration = frames::load(&options.calib, &format)?;
     let mut evaluation = options.frames.load(&FrameFormat::of_graph(&fused))?;
     if options.mirror {
         evaluation.extend(evaluation.iter().map(Frame::mirrored).collect::<Vec<_>>());
     }
     progress.set_length((variants.len() * evaluation.len()) as u64);
+    progress.set_message("calibrate");
     let mut bench = Bench::new(fused, &calibration, &evaluation)?;
     let mut passes = PassOptions::default();
     let mut rows = Vec::new();
@@ -123,15 +130,16 @@ pub struct Bench<'a> {
     calibration: Vec<Vec<Vec<f32>>>,
     statistics: Statistics,
     evaluation: &'a [Frame],
-    /// Per frame: the pooled vector and the waypoints.
+    /// Per frame: the pooled vector and the first output.
     expected: Vec<[Vec<f32>; 2]>,
+    is_classifier: bool,
 }
 
 impl<'a> Bench<'a> {
     /// Calibrates a graph and runs f32 on the evaluation frames.
     ///
     /// # Errors
-    /// No pooled vector in the graph, or frames that it does not accept.
+    /// No output in the graph, or frames that it does not accept.
     pub fn new(graph: Graph, calibration: &[Frame], evaluation: &'a [Frame]) -> Result<Self> {
         let vector = vector_name(&graph)?.to_owned();
         let calibration = pipeline::raw_inputs(&graph, calibration)?;
@@ -146,7 +154,8 @@ impl<'a> Bench<'a> {
             })?;
             expected.push([seen, outputs.into_iter().next().unwrap_or_default()]);
         }
-        Ok(Self { graph, calibration, statistics, evaluation, expected })
+        let is_classifier = FrameFormat::of_graph(&graph).classes.is_some();
+        Ok(Self { graph, calibration, statistics, evaluation, expected, is_classifier })
     }
 
     /// Quantizes with these choices and evaluates. `progress` is called after each frame with the number done.
@@ -154,16 +163,21 @@ impl<'a> Bench<'a> {
     /// # Errors
     /// The quantizer refuses the choices.
     pub fn measure(&self, options: &QuantizeOptions, mut progress: impl FnMut(usize)) -> Result<Fidelity> {
-        let model = quantize(&self.graph, &self.calibration, &self.statistics, options)?;
+        let model = quantize(&self.graph, &self.calibration, &self.statistics, options, |_, _| {})?;
         let mut vectors = ErrorSums::default();
         let mut distances = Vec::new();
+        let mut classes = Comparison::default();
         for (index, (frame, expected)) in self.evaluation.iter().zip(&self.expected).enumerate() {
-            let [vector, waypoints] = self.integers(&model, frame)?;
+            let [vector, output] = self.integers(&model, frame)?;
             vectors.add(&expected[0], &vector);
-            distances.resize(waypoints.len() / 2, Spread::default());
-            let pairs = expected[1].chunks_exact(2).zip(waypoints.chunks_exact(2));
-            for ((e, f), distance) in pairs.zip(&mut distances) {
-                distance.add(1e3 * f64::from(e[0] - f[0]).hypot(f64::from(e[1] - f[1])));
+            if self.is_classifier {
+                classes.add(frame, &output, Some(&expected[1]));
+            } else {
+                distances.resize(output.len() / 2, Spread::default());
+                let pairs = expected[1].chunks_exact(2).zip(output.chunks_exact(2));
+                for ((e, f), distance) in pairs.zip(&mut distances) {
+                    distance.add(1e3 * f64::from(e[0] - f[0]).hypot(f64::from(e[1] - f[1])));
+                }
             }
             progress(index + 1);
         }
@@ -171,6 +185,7 @@ impl<'a> Bench<'a> {
             vector_sqnr_db: vectors.sqnr_db(),
             mean_mm: distances.iter().map(Spread::mean).collect(),
             worst_mm: distances.iter().map(Spread::max).collect(),
+            classes: classes.summary(),
         })
     }
 
@@ -194,7 +209,7 @@ fn real(tensor: &QTensor, codes: &[f64]) -> Vec<f32> {
 }
 
 fn vector_name(graph: &Graph) -> Result<&str> {
-    let pool = graph.nodes.iter().rfind(|node| matches!(node.op, Op::GlobalPool));
-    pool.map(|node| node.name.as_str())
-        .ok_or_else(|| Error::new(ErrorCode::Unsupported, &graph.name, "found no global pool to measure at"))
+    let pool = graph.nodes.iter().rfind(|node| matches!(node.op, Op::GlobalPool)).map(|node| node.name.as_str());
+    let output = || graph.outputs.first().map(|&id| graph.value(id).name.as_str());
+    pool.or_else(output).ok_or_else(|| Error::new(ErrorCode::Unsupported, &graph.name, "found no output to measure at"))
 }

@@ -1,36 +1,32 @@
-//! The command line: `run`, `verify`, `ablate`, and the demo without any of them.
+//! The command line: `run`, `verify`, `diff`, `ablate`, `bench`, `schema`, `completions`, and the demo without any of
+//! them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
 use crate::ablation;
 use crate::backends::{Backend, BackendKind};
+use crate::diff::Diff;
 use crate::files::FrameSource;
-use crate::report::{VerifyReport, json, terminal};
-use crate::{demo, run, verify};
+use crate::gates::{self, Gates};
+use crate::noise::{self, Selection};
+use crate::report::{self, VerifyReport, html, json, terminal};
+use crate::{bench, demo, run, verify};
 use clap::{Args, Parser, Subcommand};
-use indicatif::{ProgressBar, ProgressStyle};
-use model_compiler::cli::ImportArgs;
+use indicatif::ProgressBar;
+use model_compiler::artifact;
+use model_compiler::cli::{CompletionArgs, ImportArgs, progress_bar};
 use model_compiler::error::{Error, ErrorCode, Result};
+use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+mod examples;
 
 pub use model_compiler::cli::Console;
 
-const EXAMPLES: &str =
-    "Without a command: the demo. It compiles the bundled network (small and untrained), runs it, verifies every
-byte, and writes image, record and report.
-
-Examples:
-  host-sim
-  host-sim run transfuser.img --frames frames/
-  host-sim run transfuser.pth --inputs inputs.safetensors --json
-  host-sim verify transfuser.img --model transfuser.pth --frames frames/ --mirror --min-sqnr 20
-  host-sim verify transfuser.img --inputs inputs.safetensors
-  host-sim ablate transfuser.pth --calib frames/ --frames drive/";
-
 /// Runs a driving network on the firmware's own engine, and proves that its numbers are right.
 #[derive(Debug, Parser)]
-#[command(version, about, after_help = EXAMPLES, args_conflicts_with_subcommands = true)]
+#[command(version, about, after_help = examples::ALL, args_conflicts_with_subcommands = true)]
 pub struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
@@ -43,10 +39,10 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Waypoints of frames: int8 from a model image, f32 from a checkpoint.
-    #[command(after_help = EXAMPLES)]
+    /// Waypoints or classes of frames: int8 from a model image, f32 from a checkpoint or ONNX file.
+    #[command(after_help = examples::RUN)]
     Run {
-        /// Model image (OUT.img) or checkpoint.
+        /// Model image (OUT.img), checkpoint or ONNX file.
         #[arg(value_name = "OUT.img|MODEL")]
         model: PathBuf,
         #[command(flatten)]
@@ -59,12 +55,12 @@ enum Command {
         common: Common,
     },
     /// Compares every byte of every step with an f64 model, and every value with the f32 network.
-    #[command(after_help = EXAMPLES)]
+    #[command(after_help = examples::VERIFY)]
     Verify {
         /// Model image.
         #[arg(value_name = "OUT.img")]
         image: PathBuf,
-        /// The checkpoint that it was compiled from; without it only bytes are compared.
+        /// The checkpoint or ONNX file that it was compiled from; without it only bytes are compared.
         #[arg(long, value_name = "MODEL")]
         model: Option<PathBuf>,
         #[command(flatten)]
@@ -79,20 +75,30 @@ enum Command {
         /// Also run the mirror image of every frame (more evaluation frames, unknown to the calibration).
         #[arg(long)]
         mirror: bool,
-        /// Exit 1 where a step's SQNR against the f32 network is lower.
-        #[arg(long, value_name = "DB")]
-        min_sqnr: Option<f64>,
+        #[command(flatten)]
+        gates: GateArgs,
+        /// Report of an earlier verification (report.json) to compare with, step by step.
+        #[arg(long, value_name = "OLD.json")]
+        baseline: Option<PathBuf>,
+        /// Write report.html and report.json to this folder.
+        #[arg(long, value_name = "DIR")]
+        report: Option<PathBuf>,
+        /// Measure the share of each tensor in the output's noise in a large network, too: of the COUNT tensors with the
+        /// lowest local SQNR [default: 64]. In a small network all of them are measured anyway.
+        #[arg(long, value_name = "COUNT", num_args = 0..=1, require_equals = true)]
+        noise_share: Option<Option<usize>>,
         #[command(flatten)]
         common: Common,
     },
-    /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, waypoint error.
-    #[command(after_help = EXAMPLES)]
+    /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, and waypoint error, or SQNR
+    /// of the logits and agreement of the classes.
+    #[command(after_help = examples::ABLATE)]
     Ablate {
         /// Checkpoint.
         model: PathBuf,
         #[command(flatten)]
         import: ImportArgs,
-        /// Calibration frames: a frame directory or a .safetensors file of raw inputs.
+        /// Calibration frames: a frame directory (for classifiers: of images) or a .safetensors file of raw inputs.
         #[arg(long, value_name = "FRAMES|FILE")]
         calib: PathBuf,
         #[command(flatten)]
@@ -103,13 +109,131 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
+    /// What changed from one report of a verification to another, without running anything.
+    #[command(after_help = examples::DIFF)]
+    Diff {
+        /// Earlier report (report.json).
+        #[arg(value_name = "OLD.json")]
+        old: PathBuf,
+        /// Later report.
+        #[arg(value_name = "NEW.json")]
+        new: PathBuf,
+        /// Exit 1 where a step lost more.
+        #[arg(long, value_name = "DB")]
+        max_loss: Option<f64>,
+        /// Write diff.html and diff.json to this folder.
+        #[arg(long, value_name = "DIR")]
+        report: Option<PathBuf>,
+        #[command(flatten)]
+        common: Common,
+    },
+    /// JSON Schema of the report that `verify --json` and report.json hold.
+    #[command(after_help = examples::SCHEMA)]
+    Schema {
+        #[command(flatten)]
+        common: Common,
+    },
+    /// Latency of a model image per step and whole, the backends of this machine side by side.
+    ///
+    /// One thread, seeded inputs (no figure depends on them), backends in turns. Times are CPU time of
+    /// the thread; those of whole inferences also wall time. For steady figures give the process a core
+    /// of its own: put `taskset -c N` in front of the command and let nothing else run there.
+    #[command(after_help = examples::BENCH, verbatim_doc_comment)]
+    Bench {
+        /// Model image.
+        #[arg(value_name = "OUT.img")]
+        image: PathBuf,
+        #[command(flatten)]
+        bench: BenchArgs,
+        #[command(flatten)]
+        common: Common,
+    },
+    /// Script that completes commands and options in a shell.
+    #[command(after_help = examples::COMPLETIONS)]
+    Completions(CompletionArgs),
+}
+
+#[derive(Debug, Args)]
+struct GateArgs {
+    /// Exit 1 where a step's SQNR against the f32 network is lower.
+    #[arg(long, value_name = "DB")]
+    min_sqnr: Option<f64>,
+    /// Exit 1 where the first output's SQNR against the f32 network is lower.
+    #[arg(long, value_name = "DB")]
+    min_output_sqnr: Option<f64>,
+    /// Exit 1 where a step lost more against the baseline.
+    #[arg(long, value_name = "DB")]
+    max_loss: Option<f64>,
+    /// Exit 1 where the classes of int8 and f32 agree on fewer frames.
+    #[arg(long, value_name = "PERCENT", value_parser = percent)]
+    min_agreement: Option<f64>,
+    /// Exit 1 where the class is the label on fewer frames.
+    #[arg(long, value_name = "PERCENT", value_parser = percent)]
+    min_top1: Option<f64>,
+    /// Exit 1 where a limit of this file is missed: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm,
+    /// min_agreement_percent, min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, and [steps] with
+    /// "PATTERN" = dB.
+    #[arg(long, value_name = "FILE.toml")]
+    gate: Option<PathBuf>,
+}
+
+/// A percentage; a share such as 0.9 would be a gate that nothing ever misses.
+fn percent(text: &str) -> std::result::Result<f64, String> {
+    let percent = text.parse::<f64>().ok().filter(|p| gates::is_percentage(*p));
+    percent.ok_or_else(|| format!("found {text:?}, expected {}", gates::PERCENTAGE))
+}
+
+impl GateArgs {
+    fn gates(&self) -> Result<Gates> {
+        let file = self.gate.as_deref().map(Gates::read).transpose()?.unwrap_or_default();
+        let arguments = Gates {
+            min_sqnr_db: self.min_sqnr,
+            min_output_sqnr_db: self.min_output_sqnr,
+            max_loss_db: self.max_loss,
+            min_agreement_percent: self.min_agreement,
+            min_top1_percent: self.min_top1,
+            ..Gates::default()
+        };
+        Ok(arguments.or(file))
+    }
 }
 
 #[derive(Debug, Args)]
 struct BackendArgs {
-    /// Kernels: portable, avx2 or avx512-vnni; all give the same bytes [default: the fastest of this machine].
+    /// Kernels of the engine; all give the same bytes [default: the fastest of this machine].
     #[arg(long, value_name = "NAME")]
     backend: Option<BackendKind>,
+}
+
+#[derive(Debug, Args)]
+struct BenchArgs {
+    /// Kernels to measure; may be repeated [default: all of this machine].
+    #[arg(long = "backend", value_name = "NAME")]
+    backends: Vec<BackendKind>,
+    /// Inferences per backend, and as many again for the steps [default: as many as fit into ten seconds, at least 5].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    rounds: Option<u32>,
+    /// Show the K slowest steps of the fastest backend.
+    #[arg(long, value_name = "K", default_value_t = 15)]
+    top: usize,
+    /// Show every step, in the order of execution.
+    #[arg(long, conflicts_with = "top")]
+    all: bool,
+}
+
+impl BenchArgs {
+    /// Each backend once, the portable one first.
+    fn choose(&self) -> Result<Vec<Backend>> {
+        if self.backends.is_empty() {
+            return Ok(Backend::all());
+        }
+        let kinds: BTreeSet<BackendKind> = self.backends.iter().copied().collect();
+        kinds.into_iter().map(|kind| Backend::choose(Some(kind))).collect()
+    }
+
+    fn top(&self) -> Option<usize> {
+        (!self.all).then_some(self.top)
+    }
 }
 
 impl BackendArgs {
@@ -123,7 +247,7 @@ struct Common {
     /// Machine-readable result on stdout, errors too.
     #[arg(long)]
     json: bool,
-    /// Runs the engine with a named fault, to show that the comparison can fail.
+    /// Runs the engine with a named fault, to show that the comparison can fail (kernels: `--backend portable` only).
     #[cfg(feature = "fault-injection")]
     #[arg(long, value_name = "NAME")]
     fault: Option<String>,
@@ -136,7 +260,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
         Ok(cli) => cli,
         Err(error) => return usage(&error, arguments.iter().any(|argument| argument == "--json"), &mut console),
     };
-    let json = cli.common().json;
+    let json = cli.common().is_some_and(|common| common.json);
     match cli.execute(&mut console) {
         Ok(status) => status,
         Err(error) => fail(&error, json, &mut console),
@@ -144,17 +268,19 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
 }
 
 impl Cli {
-    fn common(&self) -> &Common {
-        self.command.as_ref().map_or(&self.common, Command::common)
+    fn common(&self) -> Option<&Common> {
+        self.command.as_ref().map_or(Some(&self.common), Command::common)
     }
 
     fn execute(self, console: &mut Console<'_>) -> Result<u8> {
-        self.common().inject_fault()?;
+        self.common().map_or(Ok(()), Common::inject_fault)?;
         let progress = progress_bar();
-        match self.command {
+        let status = match self.command {
             Some(command) => command.execute(console, &progress),
             None => show(self.out, self.common.json, console, &progress),
-        }
+        };
+        progress.finish_and_clear();
+        status
     }
 }
 
@@ -169,15 +295,21 @@ fn show(out: Option<PathBuf>, json: bool, console: &mut Console<'_>, progress: &
     };
     let report = demo::demo(&bundle, &out, progress, &mut say)?;
     if json {
-        console.print(&demo::document(&report).to_string());
+        console.print(&json::verify(&report).to_string());
     }
     Ok(conclude(&report, json, console))
 }
 
 impl Command {
-    fn common(&self) -> &Common {
+    fn common(&self) -> Option<&Common> {
         match self {
-            Self::Run { common, .. } | Self::Verify { common, .. } | Self::Ablate { common, .. } => common,
+            Self::Run { common, .. }
+            | Self::Verify { common, .. }
+            | Self::Ablate { common, .. }
+            | Self::Bench { common, .. }
+            | Self::Diff { common, .. }
+            | Self::Schema { common } => Some(common),
+            Self::Completions(_) => None,
         }
     }
 
@@ -189,12 +321,30 @@ impl Command {
                 console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(0)
             }
-            Self::Verify { image, model, import, frames, backend, record, mirror, min_sqnr, common } => {
-                let import = import.options()?;
-                let backend = backend.choose()?;
+            Self::Verify {
+                image,
+                model,
+                import,
+                frames,
+                backend,
+                record,
+                mirror,
+                gates,
+                baseline,
+                report,
+                noise_share,
+                common,
+            } => {
+                let noise = noise_share
+                    .map_or(Selection::WhereCheap, |count| Selection::Lowest(count.unwrap_or(noise::DEFAULT_TENSORS)));
+                let (import, backend, gates) = (import.options()?, backend.choose()?, gates.gates()?);
                 let options =
-                    verify::Options { image, record, model, import, frames, backend, mirror, min_sqnr_db: min_sqnr };
-                let report = verify::verify(&options, progress)?;
+                    verify::Options { image, record, model, import, frames, backend, mirror, gates, baseline, noise };
+                let verified = verify::verify(&options, progress)?;
+                if let Some(folder) = &report {
+                    report::write(folder, &verified.report, &verified.frames)?;
+                }
+                let report = verified.report;
                 warn(&report, console);
                 console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
                 Ok(conclude(&report, common.json, console))
@@ -205,6 +355,60 @@ impl Command {
                 console.print(&if common.json { json::ablation(&rows).to_string() } else { terminal::ablation(&rows) });
                 Ok(0)
             }
+            Self::Diff { old, new, max_loss, report, common } => {
+                let diff = Diff::between(&json::read(&old)?, &json::read(&new)?)?;
+                compare(&diff, max_loss, report.as_deref(), common.json, console)
+            }
+            Self::Schema { .. } => {
+                console.print(&format!("{:#}", json::schema()));
+                Ok(0)
+            }
+            Self::Bench { image, bench: args, common } => {
+                let options = bench::Options { image, backends: args.choose()?, rounds: args.rounds };
+                let report = bench::bench(&options, progress)?;
+                if let Some(reason) = &report.unnamed {
+                    console.complain(&format!("warning: steps bear the names of their operators: {reason}"));
+                }
+                let table = || terminal::bench(&report, args.top());
+                console.print(&if common.json { json::bench(&report).to_string() } else { table() });
+                Ok(0)
+            }
+            Self::Completions(shell) => {
+                progress.finish_and_clear();
+                console.print(&shell.script::<Cli>());
+                Ok(0)
+            }
+        }
+    }
+}
+
+/// Shows the changes between two reports and checks the gate on them.
+fn compare(
+    diff: &Diff,
+    max_loss: Option<f64>,
+    folder: Option<&Path>,
+    json: bool,
+    console: &mut Console<'_>,
+) -> Result<u8> {
+    let gates: Vec<_> = max_loss.map(|limit| gates::loss(diff, limit)).into_iter().collect();
+    let failure = gates::failure(&gates);
+    let document = json::diff(diff, &gates, failure.as_ref());
+    if let Some(folder) = folder {
+        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, &e))?;
+        let page = html::diff_page(diff, &gates);
+        artifact::write_files(&[
+            (&folder.join("diff.html"), page.as_bytes()),
+            (&folder.join("diff.json"), &json::bytes(&document)),
+        ])?;
+    }
+    console.print(&if json { document.to_string() } else { terminal::diff(diff) + &terminal::gates(&gates) });
+    match failure {
+        None => Ok(0),
+        Some(failure) => {
+            if !json {
+                console.complain(&format!("error: {failure}"));
+            }
+            Ok(failure.code.exit_status())
         }
     }
 }
@@ -280,12 +484,6 @@ fn usage(error: &clap::Error, json: bool, console: &mut Console<'_>) -> u8 {
     fail(&Error::new(ErrorCode::Usage, "command line", message.trim()), true, console)
 }
 
-/// On stderr, and only if that is a terminal.
-fn progress_bar() -> ProgressBar {
-    let style = ProgressStyle::with_template("{msg} [{wide_bar}] {percent} % {eta}").expect("the template is valid");
-    ProgressBar::new(0).with_style(style.progress_chars("=> "))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -306,6 +504,9 @@ mod tests {
         assert!(parse("host-sim run a.img --inputs f.safetensors --json").is_ok());
         assert!(parse("host-sim run a.img").is_err());
         assert!(parse("host-sim verify a.img --frames f --inputs g").is_err());
+        assert!(parse("host-sim verify a.img --frames f --frames-limit 3 --resize 256").is_ok());
+        assert!(parse("host-sim verify a.img --frames f --frames-limit 0").is_err());
+        assert!(parse("host-sim verify a.img --frames-limit 3").is_err());
     }
 
     #[test]
@@ -318,10 +519,47 @@ mod tests {
     }
 
     #[test]
+    fn every_command_has_examples_and_they_parse() {
+        let program = Cli::command();
+        for command in std::iter::once(&program).chain(program.get_subcommands()) {
+            let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let examples: Vec<&str> = help.lines().filter_map(|line| line.strip_prefix("  ")).collect();
+            assert!(!examples.is_empty(), "{} has no examples", command.get_name());
+            for example in examples {
+                let words: Vec<&str> = example.split_whitespace().collect();
+                Cli::try_parse_from(&words).unwrap_or_else(|e| panic!("{example}: {e}"));
+                assert!(command.get_name() == "host-sim" || words[1] == command.get_name(), "{example}");
+            }
+        }
+    }
+
+    #[test]
+    fn bench_takes_each_backend_once() {
+        let choose = |arguments: &str| {
+            let cli = parse(&format!("host-sim bench a.img{arguments}")).unwrap();
+            let Some(Command::Bench { bench, .. }) = cli.command else { panic!("not bench") };
+            let kinds: Vec<BackendKind> = bench.choose().unwrap().into_iter().map(Backend::kind).collect();
+            (kinds, bench.top())
+        };
+        assert_eq!(choose(" --backend portable --backend portable --all"), (vec![BackendKind::Portable], None));
+        let every: Vec<BackendKind> = Backend::all().into_iter().map(Backend::kind).collect();
+        assert_eq!(choose(""), (every, Some(15)));
+        assert!(parse("host-sim bench a.img --top 3 --all").is_err());
+        assert!(parse("host-sim bench a.img --rounds 0").is_err());
+    }
+
+    #[test]
     fn verify_takes_its_options() {
         let cli = parse("host-sim verify a.img --model m.pth --frames f --mirror --min-sqnr 20.5 --record r").unwrap();
-        let Some(Command::Verify { model, record, mirror, min_sqnr, .. }) = cli.command else { panic!("not verify") };
+        let Some(Command::Verify { model, record, mirror, gates, noise_share, .. }) = cli.command else {
+            panic!("not verify")
+        };
         assert_eq!((model, record), (Some("m.pth".into()), Some("r".into())));
-        assert_eq!((mirror, min_sqnr), (true, Some(20.5)));
+        assert_eq!((mirror, gates.min_sqnr, noise_share), (true, Some(20.5), None));
+        for (option, expected) in [("--noise-share", Some(None)), ("--noise-share=9", Some(Some(9)))] {
+            let cli = parse(&format!("host-sim verify a.img --frames f {option}")).unwrap();
+            let Some(Command::Verify { noise_share, .. }) = cli.command else { panic!("not verify") };
+            assert_eq!(noise_share, expected);
+        }
     }
 }

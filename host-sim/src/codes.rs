@@ -2,7 +2,7 @@
 
 use firmware::program::Clamp;
 use firmware::tensor::ElementType;
-use model_compiler::qmodel::{QOp, QTensor};
+use model_compiler::qmodel::{QOp, QStep, QTensor};
 
 /// The integers behind little-endian element bytes. Scratch bytes count as unsigned.
 pub fn decode(bytes: &[u8], element: ElementType) -> Vec<i32> {
@@ -30,36 +30,56 @@ pub fn dequantize(tensor: &QTensor, codes: &[i32]) -> Vec<f32> {
     codes.iter().map(real).collect()
 }
 
-/// The output bounds at which codes saturate. A lower bound equal to the zero point is a ReLU and no loss: `None`.
+/// Lowest and highest real value that an operator can write to its output: clamp bounds, or the range of the type.
+pub fn clip_range(tensor: &QTensor, op: &QOp) -> [f64; 2] {
+    let (low, high) = match tensor.element {
+        ElementType::I8 => (i32::from(i8::MIN), i32::from(i8::MAX)),
+        ElementType::I16 => (i32::from(i16::MIN), i32::from(i16::MAX)),
+        ElementType::I32 => (i32::MIN, i32::MAX),
+        ElementType::Scratch => (0, i32::from(u8::MAX)),
+    };
+    let (low, high) = output_clamp(op).map_or((low, high), |(c, _)| (low.max(c.min.into()), high.min(c.max.into())));
+    [low, high].map(|code| tensor.scale * (f64::from(code) - f64::from(tensor.zero_point)))
+}
+
+/// Clamp and zero point of an operator's output; `None` for copies, probabilities and waypoints.
+fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
+    match op {
+        QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } => Some((rescale.clamp, rescale.zero_point)),
+        QOp::AveragePool { clamp, zero_point, .. }
+        | QOp::GlobalPool { clamp, zero_point, .. }
+        | QOp::Add { clamp, zero_point, .. }
+        | QOp::Requantize { clamp, zero_point, .. }
+        | QOp::ResizeBilinear { clamp, zero_point, .. }
+        | QOp::Tokens { clamp, zero_point, .. }
+        | QOp::LayerNorm { clamp, zero_point, .. }
+        | QOp::Attention { clamp, zero_point, .. }
+        | QOp::Concat { clamp, zero_point, .. } => Some((*clamp, *zero_point)),
+        QOp::MaxPool { .. } | QOp::CopyBox { .. } | QOp::Softmax { .. } | QOp::WaypointDecoder(_) => None,
+    }
+}
+
+/// The output bounds at which codes saturate; `None` for bounds of the network itself (ReLU, clip), which are no loss,
+/// and for a lower bound equal to the zero point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct SaturationBounds {
     min: Option<i16>,
-    max: i16,
+    max: Option<i16>,
 }
 
 impl SaturationBounds {
-    /// The bounds of an operator; `None` where its output cannot saturate (copies, waypoints).
-    pub fn of(op: &QOp) -> Option<Self> {
-        let (clamp, zero_point) = match op {
-            QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } => (rescale.clamp, rescale.zero_point),
-            QOp::AveragePool { clamp, zero_point, .. }
-            | QOp::GlobalPool { clamp, zero_point, .. }
-            | QOp::Add { clamp, zero_point, .. }
-            | QOp::Requantize { clamp, zero_point, .. }
-            | QOp::ResizeBilinear { clamp, zero_point, .. }
-            | QOp::Tokens { clamp, zero_point, .. }
-            | QOp::LayerNorm { clamp, zero_point, .. }
-            | QOp::Attention { clamp, zero_point, .. } => (*clamp, *zero_point),
-            QOp::MaxPool { .. } | QOp::WaypointDecoder(_) => return None,
-        };
+    /// The bounds of a step; `None` where its output cannot saturate (copies, probabilities, waypoints).
+    pub fn of(step: &QStep) -> Option<Self> {
+        let (clamp, zero_point) = output_clamp(&step.op)?;
         let Clamp { min, max } = clamp;
-        Some(Self { min: (min != zero_point).then_some(min), max })
+        let [low, high] = step.bounds.clipped;
+        Some(Self { min: (min != zero_point && !low).then_some(min), max: (!high).then_some(max) })
     }
 
     /// How many codes lie at a bound.
     pub fn count(&self, codes: &[i32]) -> u64 {
-        let at_bound =
-            |&&code: &&i32| code == i32::from(self.max) || self.min.is_some_and(|min| code == i32::from(min));
+        let bounds = [self.min, self.max];
+        let at_bound = |&&code: &&i32| bounds.into_iter().flatten().any(|bound| code == i32::from(bound));
         codes.iter().filter(at_bound).count() as u64
     }
 }
@@ -69,7 +89,7 @@ mod tests {
     use super::*;
     use firmware::program::Requant;
     use firmware::tensor::Shape;
-    use model_compiler::qmodel::QTensorId;
+    use model_compiler::qmodel::{Bounds, QTensorId};
 
     #[test]
     fn elements_are_little_endian_and_signed() {
@@ -93,18 +113,55 @@ mod tests {
     }
 
     #[test]
-    fn the_relu_bound_is_not_saturation() {
-        let op = |zero_point, min| QOp::Requantize {
+    fn the_clip_range_is_that_of_the_clamp_or_of_the_type() {
+        let mut tensor = QTensor {
+            name: "t".into(),
+            value: "t".into(),
+            shape: Shape::vector(2),
+            element: ElementType::I8,
+            scale: 0.5,
+            zero_point: -128,
+            saturation_ppm: None,
+        };
+        let pool = QOp::MaxPool {
+            input: QTensorId(0),
+            output: QTensorId(1),
+            window: firmware::program::Window::square(2, 2, 0),
+        };
+        assert_eq!(clip_range(&tensor, &pool), [0.0, 127.5]);
+        let relu = QOp::Requantize {
             input: QTensorId(0),
             output: QTensorId(1),
             input_zero_point: 0,
             requant: Requant { multiplier: 1 << 23, shift: 23 },
-            zero_point,
-            clamp: Clamp { min, max: 127 },
+            zero_point: 0,
+            clamp: Clamp { min: 0, max: 127 },
         };
-        let codes = [-128, -128, 0, 5, 127];
-        assert_eq!(SaturationBounds::of(&op(-128, -128)).unwrap().count(&codes), 1);
-        assert_eq!(SaturationBounds::of(&op(0, -128)).unwrap().count(&codes), 3);
-        assert_eq!(SaturationBounds::of(&op(5, 5)).unwrap().count(&codes), 1);
+        tensor.zero_point = 0;
+        assert_eq!(clip_range(&tensor, &relu), [0.0, 63.5]);
+    }
+
+    #[test]
+    fn bounds_of_the_network_are_not_saturation() {
+        let step = |zero_point, min, clipped| QStep {
+            name: "step".into(),
+            node: None,
+            op: QOp::Requantize {
+                input: QTensorId(0),
+                output: QTensorId(1),
+                input_zero_point: 0,
+                requant: Requant { multiplier: 1 << 23, shift: 23 },
+                zero_point,
+                clamp: Clamp { min, max: 127 },
+            },
+            bounds: Bounds { clipped, ..Bounds::default() },
+        };
+        let saturated = |step: &QStep| SaturationBounds::of(step).unwrap().count(&[-128, -128, 0, 5, 127]);
+        assert_eq!(saturated(&step(-128, -128, [false; 2])), 1);
+        assert_eq!(saturated(&step(0, -128, [false; 2])), 3);
+        assert_eq!(saturated(&step(5, 5, [false; 2])), 1);
+        assert_eq!(saturated(&step(0, -128, [true, false])), 1);
+        assert_eq!(saturated(&step(0, -128, [false, true])), 2);
+        assert_eq!(saturated(&step(0, -128, [true; 2])), 0);
     }
 }

@@ -3,7 +3,8 @@
 use crate::codes::decode;
 use firmware::tensor::{ElementType, Shape};
 use model_compiler::error::{Error, ErrorCode};
-use serde::Serialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 /// Differing elements of one tensor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -37,7 +38,7 @@ pub fn first_difference(found: &[u8], expected: &[u8], element: ElementType) -> 
 }
 
 /// The first unequal step of a frame, in the order of execution.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct StepDifference {
     /// Frame.
     pub frame: String,

@@ -4,7 +4,7 @@
 //! ```text
 //! checkpoint ─► import ─► calibrate, quantize ─► compile for a microcontroller ─► demo.img, demo.record
 //!                              ▲                                                        │
-//!                     calibration frames                  evaluation frames ─► run and verify ─► report.json
+//!                     calibration frames                  evaluation frames ─► run and verify ─► report.html, report.json
 //! ```
 //!
 //! The bundled network is small and untrained. What the demo shows is that the engine computes what the arithmetic's
@@ -12,10 +12,11 @@
 
 use crate::backends::Backend;
 use crate::files::{self, FrameSource};
-use crate::report::{VerifyReport, json, terminal};
-use crate::verify;
+use crate::gates::Gates;
+use crate::noise::Selection;
+use crate::report::{self, VerifyReport, terminal};
+use crate::verify::{self, Verified};
 use indicatif::ProgressBar;
-use model_compiler::artifact;
 use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::frames::Frame;
 use model_compiler::import::ImportOptions;
@@ -25,7 +26,6 @@ use model_compiler::pipeline::{self, Compiled};
 use model_compiler::qmodel::QModel;
 use model_compiler::quantize::QuantizeOptions;
 use model_compiler::target::Target;
-use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 /// What must be known before anything else.
@@ -86,7 +86,8 @@ impl Bundle {
     }
 }
 
-/// Compiles the bundled network, runs and verifies it, and writes `demo.img`, `demo.record` and `report.json` to `out`.
+/// Compiles the bundled network, runs and verifies it, and writes `demo.img`, `demo.record`, `report.html` and
+/// `report.json` to `out`.
 /// `say` gets the text for people, piece by piece. Unequal bytes are in the report, no error.
 ///
 /// # Errors
@@ -103,18 +104,11 @@ pub fn demo(bundle: &Bundle, out: &Path, progress: &ProgressBar, say: &mut dyn F
     std::fs::create_dir_all(out).map_err(|e| Error::io(out, &e))?;
     pipeline::write(&compiled, &image)?;
     say(&compiled_for(&compiled));
-    let report = verified(bundle, image, progress)?;
-    let document = format!("{:#}\n", document(&report));
-    artifact::write_file(&out.join("report.json"), document.as_bytes())?;
+    let Verified { mut report, frames } = verified(bundle, image, progress)?;
+    report.untrained = true;
+    report::write(out, &report, &frames)?;
     say(&results(bundle, out, &report));
     Ok(report)
-}
-
-/// The report for machines, which says too that the network is untrained.
-pub fn document(report: &VerifyReport) -> Value {
-    let mut document = json::verify(report);
-    document["untrained"] = true.into();
-    document
 }
 
 fn imported(bundle: &Bundle, graph: &Graph) -> String {
@@ -142,16 +136,18 @@ fn compiled_for(compiled: &Compiled) -> String {
     format!("compile    for {}: image {} B, arena {} B", record.target, compiled.image.len(), plan.arena_bytes)
 }
 
-fn verified(bundle: &Bundle, image: PathBuf, progress: &ProgressBar) -> Result<VerifyReport> {
+fn verified(bundle: &Bundle, image: PathBuf, progress: &ProgressBar) -> Result<Verified> {
     let options = verify::Options {
         image,
         record: None,
         model: Some(bundle.checkpoint()),
         import: ImportOptions::default(),
-        frames: FrameSource { frames: Some(bundle.frames("evaluation")), inputs: None },
+        frames: FrameSource { frames: Some(bundle.frames("evaluation")), ..FrameSource::default() },
         backend: Backend::choose(None)?,
         mirror: true,
-        min_sqnr_db: None,
+        gates: Gates::default(),
+        baseline: None,
+        noise: Selection::WhereCheap,
     };
     progress.reset();
     verify::verify(&options, progress)
@@ -159,12 +155,11 @@ fn verified(bundle: &Bundle, image: PathBuf, progress: &ProgressBar) -> Result<V
 
 fn results(bundle: &Bundle, out: &Path, report: &VerifyReport) -> String {
     let frames = shown(&bundle.frames("evaluation"));
-    let pooled = report.steps.iter().find(|step| step.op == "global_pool").and_then(|step| step.sqnr_db);
-    let pooled = pooled.map(|db| format!("pooled vector          {db:.1} dB\n")).unwrap_or_default();
     format!(
         "verify     {} frames: those of {frames} and their mirror images\n\n\
-         Waypoints in meters (of an untrained network: they mean nothing)\n\n{}\n\n{}{pooled}\n\
-         Written to {}: demo.img (to flash), demo.record (what it is made of), report.json (every step)\n\
+         Waypoints in meters (of an untrained network: they mean nothing)\n\n{}\n\n{}\n\
+         Written to {}: demo.img (to flash), demo.record (what it is made of), report.html (to \
+         look at), report.json (every figure)\n\
          Once more by hand: cargo run --release -p host-sim -- verify {} --model {} --frames {frames} --mirror",
         report.frames.len(),
         terminal::waypoints(&report.frames),

@@ -1,7 +1,8 @@
 //! The files of a run: image, record, checkpoint, frames.
 
-use firmware::image::{Image, layout};
+use firmware::image::{Image, Port, layout};
 use model_compiler::artifact;
+use model_compiler::cli::ResizeArgs;
 use model_compiler::emit::AlignedBytes;
 use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::frames::{self, Frame, FrameFormat};
@@ -10,6 +11,7 @@ use model_compiler::ir::{Graph, InputKind};
 use model_compiler::passes::PassOptions;
 use model_compiler::pipeline;
 use model_compiler::record::Record;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 
 /// A model image in memory, aligned as in flash.
@@ -25,12 +27,12 @@ impl ImageFile {
     /// # Errors
     /// The file cannot be read or is no image.
     pub fn read(path: &Path) -> Result<Self> {
-        let bytes = read(path)?;
+        let bytes = read_aligned(path).map_err(|e| Error::io(path, &e))?;
         if !is_image(&bytes) {
             let error = Error::new(ErrorCode::Malformed, path.display().to_string(), "this is no model image");
             return Err(error.with_help("model-compiler compile makes one: compile MODEL --calib FRAMES -o OUT.img"));
         }
-        Ok(Self { path: path.to_path_buf(), bytes: AlignedBytes::from(bytes.as_slice()) })
+        Ok(Self { path: path.to_path_buf(), bytes })
     }
 
     /// The image behind the bytes.
@@ -83,7 +85,6 @@ impl ImageFile {
 /// # Errors
 /// The file cannot be read.
 pub fn is_image_file(path: &Path) -> Result<bool> {
-    use std::io::Read;
     let mut start = Vec::new();
     let file = std::fs::File::open(path).map_err(|e| Error::io(path, &e))?;
     file.take(layout::MAGIC.len() as u64).read_to_end(&mut start).map_err(|e| Error::io(path, &e))?;
@@ -111,15 +112,34 @@ pub fn load_graph(path: &Path, import: &ImportOptions) -> Result<Graph> {
 }
 
 /// Where frames come from.
-#[derive(Clone, Debug, PartialEq, Eq, clap::Args)]
-#[group(required = true, multiple = false)]
+#[derive(Clone, Debug, Default, PartialEq, Eq, clap::Args)]
+#[group(skip)]
 pub struct FrameSource {
-    /// Frame directory: a folder per frame with rgb.png, lidar.bin and frame.json.
-    #[arg(long, value_name = "DIR")]
+    /// Frame directory: a folder per frame with rgb.png, lidar.bin and frame.json; for classifiers: a folder of images,
+    /// optionally with labels.csv (lines FILE,LABEL or FILE,LABEL,NAME).
+    #[arg(long, value_name = "DIR", required_unless_present = "inputs", conflicts_with = "inputs")]
     pub frames: Option<PathBuf>,
-    /// Raw network inputs by name, first dimension = frames.
+    /// Raw network inputs by name, first dimension = frames; of a classifier also `label`.
     #[arg(long, value_name = "FILE.safetensors")]
     pub inputs: Option<PathBuf>,
+    /// Which of them, and how they are read.
+    #[command(flatten)]
+    pub selection: FrameSelection,
+}
+
+/// Which frames of a source, and how they are read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::Args)]
+pub struct FrameSelection {
+    /// Only the first N frames.
+    #[arg(long, value_name = "N", value_parser = limit)]
+    pub frames_limit: Option<usize>,
+    /// Images of another size.
+    #[command(flatten)]
+    pub resize: ResizeArgs,
+}
+
+fn limit(text: &str) -> std::result::Result<usize, String> {
+    text.parse().ok().filter(|&n| n > 0).ok_or_else(|| format!("found {text:?}, expected a number of frames from 1"))
 }
 
 impl FrameSource {
@@ -128,6 +148,13 @@ impl FrameSource {
     /// # Errors
     /// See [`frames::load`]; also a file where a directory is expected and the other way round.
     pub fn load(&self, format: &FrameFormat) -> Result<Vec<Frame>> {
+        let format = FrameFormat { resize: self.selection.resize.resize, ..format.clone() };
+        let mut frames = self.load_all(&format)?;
+        frames.truncate(self.selection.frames_limit.unwrap_or(usize::MAX));
+        Ok(frames)
+    }
+
+    fn load_all(&self, format: &FrameFormat) -> Result<Vec<Frame>> {
         let usage = |path: &Path, message: &str| Err(Error::new(ErrorCode::Usage, path.display().to_string(), message));
         match (&self.frames, &self.inputs) {
             (Some(path), _) if path.is_file() => usage(path, "--frames takes a directory; a file goes to --inputs"),
@@ -145,26 +172,44 @@ impl FrameSource {
 /// # Errors
 /// An input has a name that no sensor fills.
 pub fn frame_format(image: &Image<'_>) -> Result<FrameFormat> {
-    let mut inputs = Vec::new();
-    for port in (0..image.input_count()).filter_map(|i| image.input(i)) {
-        let shape = image.tensor(port.tensor).map(|record| record.shape);
-        inputs.extend(shape.map(|shape| (input_kind(port.name), shape)));
-    }
-    let inputs = inputs.into_iter().map(|(kind, shape)| Ok((kind?, shape))).collect::<Result<Vec<_>>>()?;
+    let ports = (0..image.input_count()).filter_map(|i| image.input(i));
+    let shape = |id| image.tensor(id).map(|record| record.shape);
+    let inputs = ports.filter_map(|port| Some((port, shape(port.tensor)?)));
+    let inputs = inputs.map(|(port, shape)| Ok((input_kind(&port)?, shape))).collect::<Result<Vec<_>>>()?;
     // The height that splits the histogram is not in the image; of the systems with a histogram only TransFuser
     // reads the speed.
     let reads_speed = inputs.iter().any(|(kind, _)| *kind == InputKind::Velocity);
-    Ok(FrameFormat::new(if reads_speed { "transfuser" } else { "late_fusion" }, inputs))
+    let format = FrameFormat::new(if reads_speed { "transfuser" } else { "late_fusion" }, inputs);
+    let name = image.input(0).map_or("", |port| port.name);
+    Ok(format.with_output(name, image.output(0).and_then(|port| shape(port.tensor))))
 }
 
-/// What an input of this name holds.
+/// What an input holds: by its name, or, since classifiers name theirs as they like, an image by its codes (one per
+/// grey level, zero point −128).
 ///
 /// # Errors
-/// The name is unknown.
-pub fn input_kind(name: &str) -> Result<InputKind> {
+/// The name is unknown, and it is no image.
+pub fn input_kind(port: &Port<'_>) -> Result<InputKind> {
     let kinds = [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal];
-    let kind = kinds.into_iter().find(|&kind| frames::input_name(kind) == name);
-    kind.ok_or_else(|| Error::new(ErrorCode::Unsupported, format!("input `{name}`"), "no sensor gives this input"))
+    let named = kinds.into_iter().find(|&kind| frames::input_name(kind) == port.name);
+    let is_image = port.scale == 1.0 && port.zero_point == -128;
+    named.or(is_image.then_some(InputKind::Image)).ok_or_else(|| {
+        Error::new(ErrorCode::Unsupported, format!("input `{}`", port.name), "no sensor gives this input")
+    })
+}
+
+/// A file, without a second copy on the way; what has no length of its own (a pipe) is read to its end first.
+fn read_aligned(path: &Path) -> std::io::Result<AlignedBytes> {
+    let mut file = std::fs::File::open(path)?;
+    let metadata = file.metadata()?;
+    if !metadata.is_file() {
+        let mut bytes = Vec::new();
+        file.read_to_end(&mut bytes)?;
+        return Ok(AlignedBytes::from(bytes.as_slice()));
+    }
+    let mut bytes = AlignedBytes::zeroed(metadata.len() as usize);
+    file.read_exact(&mut bytes)?;
+    Ok(bytes)
 }
 
 fn read(path: &Path) -> Result<Vec<u8>> {

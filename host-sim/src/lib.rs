@@ -1,10 +1,13 @@
 //! Runs the firmware's engine on the host and says how good its numbers are.
 //!
 //! * [`backends`]: which of the firmware's kernels this machine can run
+//! * [`mod@bench`]: latency per step and whole, the backends side by side
 //! * [`demo`]: the whole way on the files of the source tree, without arguments
-//! * [`run`]: waypoints of frames, int8 from an image or f32 from a checkpoint
+//! * [`run`]: waypoints or classes of frames, int8 from an image or f32 from a checkpoint
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
 //!   f32 network: how much precision each step costs
+//! * [`report`]: what was found, as text, JSON and one HTML page; [`diff`] against an earlier report, [`gates`] for CI,
+//!   and where the noise at the output comes from ([`noise`])
 //!
 //! ```text
 //!             ┌► engine (the firmware's own code) ─► bytes of every step ─┐
@@ -17,12 +20,19 @@
 
 pub mod ablation;
 pub mod backends;
+pub mod bench;
 pub mod buffers;
+pub mod channels;
+pub mod classification;
 pub mod cli;
 pub mod codes;
 pub mod compare;
 pub mod demo;
+pub mod diff;
 pub mod files;
+pub mod gates;
+pub mod histogram;
+pub mod noise;
 pub mod report;
 pub mod run;
 pub mod statistics;

@@ -1,7 +1,8 @@
-//! Waypoints of frames: int8 from an image, f32 from a checkpoint.
+//! Waypoints or classes of frames: int8 from an image, f32 from a checkpoint.
 
 use crate::backends::Backend;
 use crate::buffers::GuardedArena;
+use crate::classification::{Accuracy, Classification};
 use crate::codes::decode;
 use crate::files::{self, FrameSource, ImageFile};
 use firmware::engine::{Engine, EngineError};
@@ -13,16 +14,18 @@ use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::frames::{Frame, FrameFormat};
 use model_compiler::import::ImportOptions;
 use model_compiler::integer_reference;
-use model_compiler::ir::Graph;
+use model_compiler::ir::{Graph, Op};
 use model_compiler::reference;
-use serde::Serialize;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// `[right, forward]` per future half second, m; forward is positive.
 pub type Waypoints = Vec<[f64; 2]>;
 
 /// Which network ran.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct ModelInfo {
     /// Its name.
     pub name: String,
@@ -35,8 +38,22 @@ pub struct ModelInfo {
 pub struct FrameResult {
     /// Frame.
     pub name: String,
-    /// Where to drive.
-    pub waypoints: Waypoints,
+    /// What the network gives.
+    #[serde(flatten)]
+    pub output: Output,
+}
+
+/// What networks give.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Output {
+    /// Of a driving network.
+    Waypoints {
+        /// Where to drive.
+        waypoints: Waypoints,
+    },
+    /// Of a classifier.
+    Class(Classification),
 }
 
 /// Result of a run.
@@ -48,12 +65,36 @@ pub struct RunReport {
     pub model: ModelInfo,
     /// Every frame, in order.
     pub frames: Vec<FrameResult>,
+    /// How often a classifier is right, where frames are labeled.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub accuracy: Option<Accuracy>,
+    /// What people call the classes, as far as the labels say.
+    #[serde(skip)]
+    pub class_names: BTreeMap<usize, String>,
+}
+
+impl RunReport {
+    /// Sums up the frames of a run.
+    pub fn new(model: ModelInfo, frames: Vec<FrameResult>) -> Self {
+        let classes = frames.iter().filter_map(|frame| match &frame.output {
+            Output::Class(classification) => Some(classification),
+            Output::Waypoints { .. } => None,
+        });
+        let accuracy = Accuracy::of(classes);
+        Self { schema: 1, model, frames, accuracy, class_names: BTreeMap::new() }
+    }
+
+    fn with_names(mut self, frames: &[Frame]) -> Self {
+        let labels = frames.iter().filter_map(|frame| frame.label.as_ref()).filter(|label| !label.name.is_empty());
+        self.class_names = labels.map(|label| (usize::from(label.class), label.name.clone())).collect();
+        self
+    }
 }
 
 /// Runs a model image (int8, on the firmware's engine) or a checkpoint (f32) over frames.
 ///
 /// # Errors
-/// The model or a frame cannot be read, or the network does not give waypoints.
+/// The model or a frame cannot be read, or the network gives neither waypoints nor classes.
 pub fn run(
     model: &Path,
     import: &ImportOptions,
@@ -72,46 +113,78 @@ pub fn run(
 
 fn run_image(file: &ImageFile, source: &FrameSource, backend: Backend, progress: &ProgressBar) -> Result<RunReport> {
     let image = file.parse()?;
+    let format = files::frame_format(&image)?;
     let mut device = Device::new(image, backend)?;
-    let frames = source.load(&files::frame_format(&image)?)?;
-    let waypoints = each_frame(&frames, progress, |frame| device.waypoints(frame))?;
+    let kind = match device.record.element == ElementType::I32 && device.record.shape.channels == 2 {
+        true => OutputKind::Waypoints,
+        false => OutputKind::of_classifier(&format, image.name())?,
+    };
+    let frames = source.load(&format)?;
+    let results = each_frame(&frames, progress, |frame| Ok(kind.read(device.infer(frame)?, frame)))?;
     let model = ModelInfo { name: image.name().to_owned(), sha256: artifact::hex(&file.sha256()) };
-    Ok(RunReport { schema: 1, model, frames: waypoints })
+    Ok(RunReport::new(model, results).with_names(&frames))
 }
 
 fn run_graph(graph: &Graph, model: ModelInfo, source: &FrameSource, progress: &ProgressBar) -> Result<RunReport> {
-    let frames = source.load(&FrameFormat::of_graph(graph))?;
-    if graph.outputs.first().is_none_or(|&id| graph.value(id).shape.channels != 2) {
-        return Err(no_waypoints(&graph.name));
-    }
-    let waypoints = each_frame(&frames, progress, |frame| {
+    let format = FrameFormat::of_graph(graph);
+    let gives_waypoints = graph.outputs.first().and_then(|&id| graph.producer(id));
+    let kind = match gives_waypoints.is_some_and(|node| matches!(node.op, Op::WaypointDecoder(_))) {
+        true => OutputKind::Waypoints,
+        false => OutputKind::of_classifier(&format, &graph.name)?,
+    };
+    let frames = source.load(&format)?;
+    let results = each_frame(&frames, progress, |frame| {
         let inputs: Vec<Vec<f32>> = graph.inputs().map(|(_, kind)| frame.raw(kind)).collect::<Result<_>>()?;
-        Ok(waypoints(&reference::run(graph, &inputs, |_, _| ())?[0]))
+        let output = reference::run(graph, &inputs, |_, _| ())?.swap_remove(0);
+        Ok(kind.read(output.into_iter().map(f64::from).collect(), frame))
     })?;
-    Ok(RunReport { schema: 1, model, frames: waypoints })
+    Ok(RunReport::new(model, results).with_names(&frames))
 }
 
 fn each_frame(
     frames: &[Frame],
     progress: &ProgressBar,
-    mut infer: impl FnMut(&Frame) -> Result<Waypoints>,
+    mut infer: impl FnMut(&Frame) -> Result<Output>,
 ) -> Result<Vec<FrameResult>> {
     progress.set_length(frames.len() as u64);
     let mut result = |frame: &Frame| {
         progress.set_message(frame.name.clone());
-        let waypoints = infer(frame).map_err(|e| e.within(format!("frame {}", frame.name)))?;
+        let output = infer(frame).map_err(|e| e.within(format!("frame {}", frame.name)))?;
         progress.inc(1);
-        Ok(FrameResult { name: frame.name.clone(), waypoints })
+        Ok(FrameResult { name: frame.name.clone(), output })
     };
     frames.iter().map(&mut result).collect()
 }
 
-/// Pairs of the network's own frame (forward is negative) as waypoints.
-pub fn waypoints(values: &[f32]) -> Waypoints {
-    values.as_chunks::<2>().0.iter().map(|&[right, y]| [f64::from(right), 0.0 - f64::from(y)]).collect()
+/// How the first output is to be read.
+#[derive(Clone, Copy)]
+enum OutputKind {
+    Waypoints,
+    Classes,
 }
 
-/// An image with its working memory and the output that holds the waypoints.
+impl OutputKind {
+    fn of_classifier(format: &FrameFormat, name: &str) -> Result<Self> {
+        format.classes.map(|_| Self::Classes).ok_or_else(|| {
+            let message = "its first output holds neither waypoints nor classes";
+            Error::new(ErrorCode::Unsupported, format!("network {name}"), message)
+        })
+    }
+
+    fn read(self, values: Vec<f64>, frame: &Frame) -> Output {
+        match self {
+            Self::Waypoints => Output::Waypoints { waypoints: waypoints(&values) },
+            Self::Classes => Output::Class(Classification::new(values, frame)),
+        }
+    }
+}
+
+/// Pairs of the network's own frame (forward is negative) as waypoints.
+pub fn waypoints<T: Copy + Into<f64>>(values: &[T]) -> Waypoints {
+    values.as_chunks::<2>().0.iter().map(|&[right, y]| [right.into(), 0.0 - y.into()]).collect()
+}
+
+/// An image with its working memory and its first output.
 struct Device<'a> {
     image: Image<'a>,
     backend: Backend,
@@ -123,14 +196,15 @@ struct Device<'a> {
 impl<'a> Device<'a> {
     fn new(image: Image<'a>, backend: Backend) -> Result<Self> {
         let port = image.output(0).and_then(|port| Some((port, image.tensor(port.tensor)?)));
-        let is_waypoints = |record: &TensorRecord| record.element == ElementType::I32 && record.shape.channels == 2;
-        let (port, record) =
-            port.filter(|(_, record)| is_waypoints(record)).ok_or_else(|| no_waypoints(image.name()))?;
+        let (port, record) = port.ok_or_else(|| {
+            Error::new(ErrorCode::Unsupported, format!("network {}", image.name()), "it has no output")
+        })?;
         let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
         Ok(Self { image, backend, arena, port, record })
     }
 
-    fn waypoints(&mut self, frame: &Frame) -> Result<Waypoints> {
+    /// Real values of the first output.
+    fn infer(&mut self, frame: &Frame) -> Result<Vec<f64>> {
         let inputs = self.input_bytes(frame)?;
         let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
         let refuse = |e: EngineError| Error::new(ErrorCode::Malformed, "engine", e.to_string());
@@ -138,14 +212,13 @@ impl<'a> Device<'a> {
         engine.infer(&inputs).map_err(refuse)?;
         let codes = decode(engine.output(0).map_err(refuse)?, self.record.element);
         let real = |&code: &i32| (f64::from(code) - f64::from(self.port.zero_point)) * f64::from(self.port.scale);
-        let values: Vec<f64> = codes.iter().map(real).collect();
-        Ok(values.as_chunks::<2>().0.iter().map(|&[right, y]| [right, 0.0 - y]).collect())
+        Ok(codes.iter().map(real).collect())
     }
 
     fn input_bytes(&self, frame: &Frame) -> Result<Vec<Vec<u8>>> {
         let ports = (0..self.image.input_count()).filter_map(|i| self.image.input(i));
         let encode = |port: Port<'_>| {
-            let kind = files::input_kind(port.name)?;
+            let kind = files::input_kind(&port)?;
             let raw: Vec<f64> = frame.raw(kind)?.into_iter().map(f64::from).collect();
             let element = self.image.tensor(port.tensor).map_or(ElementType::I8, |record| record.element);
             Ok(integer_reference::to_bytes(&integer_reference::encode_input(kind, &raw), element))
@@ -154,17 +227,13 @@ impl<'a> Device<'a> {
     }
 }
 
-fn no_waypoints(name: &str) -> Error {
-    Error::new(ErrorCode::Unsupported, format!("network {name}"), "its first output holds no waypoints")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
     fn waypoints_turn_forward_positive() {
-        assert_eq!(waypoints(&[0.5, -2.0, 0.0, 0.0]), [[0.5, 2.0], [0.0, 0.0]]);
+        assert_eq!(waypoints(&[0.5_f32, -2.0, 0.0, 0.0]), [[0.5, 2.0], [0.0, 0.0]]);
         assert!(waypoints(&[0.0, 0.0])[0][1].is_sign_positive());
     }
 }

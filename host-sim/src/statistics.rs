@@ -30,6 +30,22 @@ impl ErrorSums {
         }
     }
 
+    /// Adds the sums over other pairs.
+    pub fn merge(&mut self, other: &Self) {
+        self.reference_power += other.reference_power;
+        self.test_power += other.test_power;
+        self.error_power += other.error_power;
+        self.dot += other.dot;
+        if other.largest_error > self.largest_error || other.largest_error.is_nan() {
+            self.largest_error = other.largest_error;
+        }
+    }
+
+    /// `Σ (ref − test)²`.
+    pub fn error_power(&self) -> f64 {
+        self.error_power
+    }
+
     /// `10·log10(Σ ref² / Σ (ref − test)²)`; infinite where nothing differs, not a number where a value is none.
     pub fn sqnr_db(&self) -> f64 {
         if self.error_power == 0.0 { f64::INFINITY } else { 10.0 * (self.reference_power / self.error_power).log10() }
@@ -120,6 +136,20 @@ mod tests {
         let mut turned = ErrorSums::default();
         turned.add(&[1.0, 0.0], &[0.0, 1.0]);
         assert_eq!(turned.cosine(), 0.0);
+    }
+
+    #[test]
+    fn merged_sums_are_those_over_all_pairs() {
+        let (mut first, mut second, mut both) = (ErrorSums::default(), ErrorSums::default(), ErrorSums::default());
+        first.add(&[1.0, 2.0], &[1.5, 2.0]);
+        second.add(&[-4.0], &[-4.25]);
+        both.add(&[1.0, 2.0, -4.0], &[1.5, 2.0, -4.25]);
+        first.merge(&second);
+        assert_eq!(first, both);
+        let mut broken = ErrorSums::default();
+        broken.add(&[1.0], &[f32::NAN]);
+        first.merge(&broken);
+        assert!(first.largest_error().is_nan() && first.error_power().is_nan());
     }
 
     #[test]

@@ -69,6 +69,7 @@ pub fn frame(seed: u8) -> Frame {
         goal: None,
         command: None,
         dropped_points: 0,
+        label: None,
     }
 }
 

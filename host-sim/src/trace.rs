@@ -2,8 +2,10 @@
 
 use crate::backends::Backend;
 use crate::buffers::GuardedArena;
+use crate::channels::Channels;
 use crate::codes::{SaturationBounds, decode, dequantize};
 use crate::compare::{StepDifference, first_difference};
+use crate::histogram::Histogram;
 use crate::statistics::ErrorSums;
 use firmware::engine::Engine;
 use firmware::image::Image;
@@ -15,10 +17,10 @@ use model_compiler::integer_reference;
 use model_compiler::ir::{Graph, Node, ValueId};
 use model_compiler::qmodel::{QModel, QStep, QTensor, QTensorId};
 use model_compiler::record::Record;
-use model_compiler::reference::{self, Activations};
+use model_compiler::reference::{self, Activations, Change};
 
 /// Figures of one step, summed over the traced frames.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct StepFigures {
     /// What the step itself adds: its operator in f32 on its own integer inputs, against its output.
     pub local: Option<ErrorSums>,
@@ -26,8 +28,12 @@ pub struct StepFigures {
     pub accumulated: Option<ErrorSums>,
     /// Codes written.
     pub codes: u64,
-    /// Codes at a clamp bound other than a ReLU's; `None` where the operator cannot saturate.
+    /// Codes at a clamp bound that is not the network's own; `None` where the operator cannot saturate.
     pub saturated: Option<u64>,
+    /// Distribution of the values; absent before the first frame.
+    pub histogram: Option<Histogram>,
+    /// Ranges per channel of a weighted step.
+    pub channels: Option<Channels>,
     /// The engine's bytes equal the f64 model's in every frame.
     pub equal: bool,
 }
@@ -41,6 +47,19 @@ pub struct FrameTrace {
     pub outputs: Vec<Vec<f32>>,
     /// The same from the f32 network.
     pub reference_outputs: Option<Vec<Vec<f32>>>,
+    /// Errors that have added up on this frame alone, by position; empty without an f32 network.
+    pub accumulated: Vec<ErrorSums>,
+}
+
+/// What a step alone adds, element by element, and where it goes.
+#[derive(Clone, Debug)]
+pub struct LocalError<'a> {
+    /// Position of the step.
+    pub position: usize,
+    /// The value of the f32 network that it approximates, and the nodes that read this step's output.
+    pub change: Change<'a>,
+    /// Output of the engine minus the operator in f32 on the engine's operands.
+    pub error: Vec<f32>,
 }
 
 /// Traces frames and sums up the figures of every step.
@@ -101,7 +120,12 @@ impl<'a> Tracer<'a> {
         check_record(&image, record)?;
         let reference = graph.map(|graph| FloatNetwork::new(graph, &record.model)).transpose()?;
         let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
-        let figures = vec![StepFigures { equal: true, ..StepFigures::default() }; record.plan.order.len()];
+        let figures = |&step: &u32| StepFigures {
+            equal: true,
+            channels: Channels::of(&record.model, &record.model.steps[step as usize].op),
+            ..StepFigures::default()
+        };
+        let figures = record.plan.order.iter().map(figures).collect();
         Ok(Self { image, record, reference, arena, backend, frames: 0, figures })
     }
 
@@ -130,10 +154,73 @@ impl<'a> Tracer<'a> {
         self.arena.check_guards().map_err(|e| e.within(format!("frame {}", frame.name)))?;
         self.frames += 1;
         self.count_saturation(&run);
-        let reference_outputs = self.measure(frame, &run, progress)?;
+        let activations = self.reference.as_ref().map(|network| network.run(frame)).transpose()?;
+        let accumulated = self.measure(&run, activations.as_ref(), progress);
+        let reference_outputs =
+            self.reference.as_ref().zip(activations.as_ref()).map(|(network, activations)| {
+                network.outputs.iter().map(|&id| kept(activations, id).to_vec()).collect()
+            });
         let outputs =
             model.outputs.iter().zip(&run.outputs).map(|(port, bytes)| real(model.tensor(port.tensor), bytes));
-        Ok(FrameTrace { difference, outputs: outputs.collect(), reference_outputs })
+        Ok(FrameTrace { difference, outputs: outputs.collect(), reference_outputs, accumulated })
+    }
+
+    /// The f32 network.
+    pub fn graph(&self) -> Option<&'a Graph> {
+        self.reference.as_ref().map(|network| network.graph)
+    }
+
+    /// Name of the step at a position.
+    pub fn step_name(&self, position: usize) -> &'a str {
+        &self.record.model.steps[self.record.plan.order[position] as usize].name
+    }
+
+    /// Positions of the steps whose own error can be told, with the value that each changes.
+    pub fn noisy_steps(&self) -> impl Iterator<Item = (usize, Change<'a>)> {
+        let network = self.reference.as_ref();
+        self.steps().filter_map(move |(position, step)| {
+            let counterpart = &network?.counterparts[self.record.plan.order[position] as usize];
+            let known = !matches!(counterpart.function, Function::Unknown);
+            let readers = || readers(&self.record.model, step.op.output());
+            known.then(|| (position, Change { value: counterpart.value, readers: readers() }))
+        })
+    }
+
+    /// Runs a frame without counting it: every value of the f32 network, the own errors of the steps at `positions`, and
+    /// the whole error at `target`, where a step writes that.
+    ///
+    /// # Errors
+    /// See [`Tracer::trace`].
+    pub fn local_errors(
+        &mut self,
+        frame: &Frame,
+        positions: &[usize],
+        target: ValueId,
+    ) -> Result<(Activations, Vec<LocalError<'a>>, Option<ErrorSums>)> {
+        let model = &self.record.model;
+        let hidden = ProgressBar::hidden();
+        let run = self.run_engine(&input_codes(model, frame)?, &hidden)?;
+        let Some(network) = &self.reference else {
+            return Err(Error::new(ErrorCode::Usage, "noise shares", "need the f32 network"));
+        };
+        let activations = network.run(frame)?;
+        let mut errors = Vec::new();
+        let mut whole = None;
+        for (position, change) in self.noisy_steps() {
+            let step = self.record.plan.order[position] as usize;
+            let output = || tensor_values(model, &run, model.steps[step].op.output());
+            if change.value == target {
+                whole.get_or_insert_with(ErrorSums::default).add(kept(&activations, target), &output());
+            }
+            if !positions.contains(&position) {
+                continue;
+            }
+            if let Some(ideal) = network.apply(&network.counterparts[step].function, model, &run) {
+                let error = output().iter().zip(&ideal).map(|(output, ideal)| output - ideal).collect();
+                errors.push(LocalError { position, change, error });
+            }
+        }
+        Ok((activations, errors, whole))
     }
 
     fn steps(&self) -> impl Iterator<Item = (usize, &'a QStep)> + use<'a> {
@@ -205,29 +292,47 @@ impl<'a> Tracer<'a> {
             let codes = decode(&run.tensors[step.op.output().0 as usize], tensor.element);
             let figures = &mut self.figures[position];
             figures.codes += codes.len() as u64;
-            if let Some(bounds) = SaturationBounds::of(&step.op) {
+            if let Some(bounds) = SaturationBounds::of(step) {
                 *figures.saturated.get_or_insert(0) += bounds.count(&codes);
             }
         }
     }
 
-    /// Adds the frame's errors against f32 to the figures and returns the outputs of the f32 network.
-    fn measure(&mut self, frame: &Frame, run: &EngineRun, progress: &ProgressBar) -> Result<Option<Vec<Vec<f32>>>> {
-        let Some(network) = &self.reference else { return Ok(None) };
+    /// Adds the frame's values and its errors against f32 to the figures; returns the errors that have added up.
+    fn measure(
+        &mut self,
+        run: &EngineRun,
+        activations: Option<&Activations>,
+        progress: &ProgressBar,
+    ) -> Vec<ErrorSums> {
         let model = &self.record.model;
-        let activations = network.run(frame)?;
+        let mut frame = Vec::new();
         for (position, step) in self.steps() {
-            let counterpart = &network.counterparts[self.record.plan.order[position] as usize];
+            let tensor = model.tensor(step.op.output());
             let output = tensor_values(model, run, step.op.output());
+            let step = self.record.plan.order[position] as usize;
             let figures = &mut self.figures[position];
-            let reference = kept(&activations, counterpart.value);
-            figures.accumulated.get_or_insert_default().add(reference, &output);
-            if let Some(ideal) = network.apply(&counterpart.function, model, run) {
-                figures.local.get_or_insert_default().add(&ideal, &output);
+            if let Some(channels) = &mut figures.channels {
+                channels.add(&output);
             }
-            progress.inc(1);
+            let mut reference = None;
+            if let (Some(network), Some(activations)) = (&self.reference, activations) {
+                let counterpart = &network.counterparts[step];
+                let expected = kept(activations, counterpart.value);
+                let mut sums = ErrorSums::default();
+                sums.add(expected, &output);
+                figures.accumulated.get_or_insert_default().merge(&sums);
+                frame.push(sums);
+                if let Some(ideal) = network.apply(&counterpart.function, model, run) {
+                    figures.local.get_or_insert_default().add(&ideal, &output);
+                }
+                reference = Some(expected);
+                progress.inc(1);
+            }
+            let histogram = || Histogram::spanning(tensor, reference, &output);
+            figures.histogram.get_or_insert_with(histogram).add(reference, &output);
         }
-        Ok(Some(network.outputs.iter().map(|&id| kept(&activations, id).to_vec()).collect()))
+        frame
     }
 }
 
@@ -277,6 +382,17 @@ impl<'a> Function<'a> {
         let operands: Option<Vec<QTensorId>> = node.inputs.iter().map(operand).collect();
         Ok(operands.map_or(Self::Unknown, |operands| Self::Node(node, operands)))
     }
+}
+
+/// Names of the nodes whose steps read a tensor, or a copy of it in another type.
+fn readers(model: &QModel, tensor: QTensorId) -> Vec<&str> {
+    let reading = model.steps.iter().filter(|step| step.op.reads().contains(&tensor));
+    reading
+        .flat_map(|step| match &step.node {
+            Some(node) => vec![node.as_str()],
+            None => readers(model, step.op.output()),
+        })
+        .collect()
 }
 
 fn check_record(image: &Image<'_>, record: &Record) -> Result<()> {

@@ -1,21 +1,27 @@
 //! Proof and measure of an image: its bytes against the f64 model, its numbers against the f32 network.
 
 use crate::backends::Backend;
+use crate::channels::Channels;
+use crate::classification::Comparison;
 use crate::codes;
+use crate::diff::Diff;
 use crate::files::{self, FrameSource, ImageFile};
-use crate::report::{FrameReport, StepReport, Summary, VerifyReport, WaypointError, worst};
+use crate::gates::Gates;
+use crate::noise::{self, Selection};
+use crate::report::memory::MemoryReport;
+use crate::report::{FrameReport, StepReport, Summary, VerifyReport, WaypointError, json, worst};
 use crate::run::{ModelInfo, Waypoints, waypoints};
-use crate::statistics::Spread;
+use crate::statistics::{ErrorSums, Spread};
 use crate::trace::{FrameTrace, StepFigures, Tracer};
 use firmware::image::Image;
 use firmware::tensor::ElementType;
 use indicatif::ProgressBar;
 use model_compiler::artifact;
-use model_compiler::error::{Error, ErrorCode, Result};
+use model_compiler::error::Result;
 use model_compiler::frames::{self, Frame, FrameFormat};
 use model_compiler::import::ImportOptions;
 use model_compiler::ir::Graph;
-use model_compiler::qmodel::QModel;
+use model_compiler::qmodel::{QModel, QOp};
 use model_compiler::record::Record;
 use std::path::PathBuf;
 
@@ -36,15 +42,30 @@ pub struct Options {
     pub backend: Backend,
     /// Also run the mirror image of every frame.
     pub mirror: bool,
-    /// Fail where a step's accumulated SQNR is below this, dB.
-    pub min_sqnr_db: Option<f64>,
+    /// Limits that the report must keep.
+    pub gates: Gates,
+    /// Report of an earlier verification to compare with.
+    pub baseline: Option<PathBuf>,
+    /// Tensors whose share of the output's noise is measured.
+    pub noise: Selection,
+}
+
+/// A report, and the frames that it is about.
+#[derive(Clone, Debug)]
+pub struct Verified {
+    /// What was found.
+    pub report: VerifyReport,
+    /// Every frame that was to run, in order; mirror images included.
+    pub frames: Vec<Frame>,
 }
 
 /// Runs the comparison. Unequal bytes and missed gates are in the report ([`VerifyReport::failure`]), not errors.
 ///
 /// # Errors
 /// A file cannot be read, the files do not belong together, or the engine refuses or leaves its arena.
-pub fn verify(options: &Options, progress: &ProgressBar) -> Result<VerifyReport> {
+pub fn verify(options: &Options, progress: &ProgressBar) -> Result<Verified> {
+    options.gates.check_sources(options.model.is_some(), options.baseline.is_some())?;
+    let baseline = options.baseline.as_deref().map(json::read).transpose()?;
     let file = ImageFile::read(&options.image)?;
     let image = file.parse()?;
     let record = file.record(options.record.as_deref())?;
@@ -53,16 +74,14 @@ pub fn verify(options: &Options, progress: &ProgressBar) -> Result<VerifyReport>
     if options.mirror {
         frames.extend(frames.iter().map(Frame::mirrored).collect::<Vec<_>>());
     }
-    if options.min_sqnr_db.is_some() && graph.is_none() {
-        let error = Error::new(ErrorCode::Usage, "--min-sqnr", "needs the f32 network to compare with");
-        return Err(error.with_help("add --model MODEL"));
-    }
     let sources = Sources { image, record: &record, graph: graph.as_ref(), backend: options.backend };
     let model = ModelInfo { name: record.model.name.clone(), sha256: artifact::hex(&file.sha256()) };
-    let mut report = compare(&sources, &frames, model, progress)?;
+    let mut report = compare_and_measure(&sources, &frames, model, Some(options.noise), progress)?;
     report.summary.flash_bytes = file.flash_bytes();
-    report.check(options.min_sqnr_db);
-    Ok(report)
+    report.baseline = baseline.map(|baseline| Diff::between(&baseline, &report)).transpose()?;
+    let outcomes = options.gates.outcomes(&report)?;
+    report.check(outcomes);
+    Ok(Verified { report, frames })
 }
 
 /// Everything that takes part, loaded.
@@ -88,18 +107,35 @@ pub fn compare(
     model: ModelInfo,
     progress: &ProgressBar,
 ) -> Result<VerifyReport> {
+    compare_and_measure(sources, frames, model, None, progress)
+}
+
+/// The same, and the shares of the noise where they are selected.
+fn compare_and_measure(
+    sources: &Sources<'_>,
+    frames: &[Frame],
+    model: ModelInfo,
+    noise: Option<Selection>,
+    progress: &ProgressBar,
+) -> Result<VerifyReport> {
     let record = sources.record;
     let mut tracer = Tracer::new(sources.image, record, sources.graph, sources.backend)?;
     progress.set_length(tracer.units_per_frame() * frames.len() as u64);
     let known = calibration_digests(&record.model);
     let overlap = frames::overlap(&known, frames);
     let mut waypoint_errors = Vec::new();
+    let is_classifier = FrameFormat::of_model(&record.model).classes.is_some();
+    let mut classes = Comparison::default();
     let mut first_difference = None;
     let mut frame_reports = Vec::new();
     for frame in frames {
         progress.set_message(frame.name.clone());
         let trace = tracer.trace(frame, progress)?;
-        let report = frame_report(&record.model, frame, &trace, overlap.contains(&frame.name.as_str()));
+        let mut report = frame_report(record, frame, &trace, overlap.contains(&frame.name.as_str()));
+        if is_classifier {
+            let reference = trace.reference_outputs.as_ref().map(|outputs| outputs[0].as_slice());
+            report.classes = Some(classes.add(frame, &trace.outputs[0], reference));
+        }
         add_waypoint_errors(&mut waypoint_errors, &report);
         frame_reports.push(report);
         first_difference = trace.difference;
@@ -108,18 +144,30 @@ pub fn compare(
         }
     }
     progress.finish_and_clear();
+    // A frame that the calibration has not seen, if there is one.
+    let unseen = frames.iter().find(|frame| !overlap.contains(&frame.name.as_str())).or(frames.first());
+    let noise = match (noise, unseen, &first_difference) {
+        (Some(selection), Some(frame), None) => noise::shares(&mut tracer, frame, selection, progress)?,
+        _ => None,
+    };
     let steps = step_reports(record, tracer.figures());
+    let summary = Summary { accuracy: classes.summary(), ..summary(record, &steps, &waypoint_errors) };
     Ok(VerifyReport {
-        schema: 1,
+        schema: json::SCHEMA,
         model,
         target: record.target.clone(),
+        untrained: false,
         passed: true,
         bytes_equal: first_difference.is_none(),
         first_difference,
-        summary: summary(record, &steps, &waypoint_errors),
+        summary,
         steps,
+        memory: MemoryReport::of(record),
+        noise,
         calibration_frames: overlap.into_iter().map(str::to_owned).collect(),
         frames: frame_reports,
+        gates: Vec::new(),
+        baseline: None,
         failure: None,
     })
 }
@@ -129,28 +177,52 @@ fn calibration_digests(model: &QModel) -> Vec<&str> {
     digests.map(|(_, digests)| digests.split(',').map(str::trim).collect()).unwrap_or_default()
 }
 
-fn frame_report(model: &QModel, frame: &Frame, trace: &FrameTrace, calibration: bool) -> FrameReport {
+fn frame_report(record: &Record, frame: &Frame, trace: &FrameTrace, calibration: bool) -> FrameReport {
+    let model = &record.model;
     let is_waypoints = |port: &model_compiler::qmodel::Port| {
         let tensor = model.tensor(port.tensor);
         tensor.element == ElementType::I32 && tensor.shape.channels == 2
     };
     let output = model.outputs.iter().position(is_waypoints);
     let reference = trace.reference_outputs.as_ref();
+    let found = output.map(|i| waypoints(&trace.outputs[i]));
+    let expected = output.and_then(|i| Some(waypoints(&reference?[i])));
+    let decibels = |position: Option<usize>| Some(trace.accumulated.get(position?)?.sqnr_db());
+    let rank = |sums: &ErrorSums| Some(sums.sqnr_db()).filter(|db| !db.is_nan()).unwrap_or(f64::NEG_INFINITY);
+    let worst = (0..trace.accumulated.len())
+        .min_by(|&a, &b| rank(&trace.accumulated[a]).total_cmp(&rank(&trace.accumulated[b])));
     FrameReport {
         name: frame.name.clone(),
         digest: frame.short_digest(),
         calibration,
         dropped_points: frame.dropped_points,
-        waypoints: output.map(|i| waypoints(&trace.outputs[i])),
-        reference_waypoints: output.and_then(|i| Some(waypoints(&reference?[i]))),
+        worst_step: worst.map(|position| model.steps[record.plan.order[position] as usize].name.clone()),
+        worst_sqnr_db: decibels(worst),
+        vector_sqnr_db: decibels(vector_position(record)),
+        output_sqnr_db: decibels(output_position(record)),
+        waypoint_error_mm: found.as_ref().zip(expected.as_ref()).map(|(f, e)| distances_mm(f, e)).unwrap_or_default(),
+        waypoints: found,
+        reference_waypoints: expected,
+        classes: None,
     }
 }
 
+/// Position of the step that writes the last pooled vector.
+fn vector_position(record: &Record) -> Option<usize> {
+    let is_pool = |&step: &u32| matches!(record.model.steps[step as usize].op, QOp::GlobalPool { .. });
+    record.plan.order.iter().rposition(is_pool)
+}
+
+/// Position of the step that writes the first output.
+fn output_position(record: &Record) -> Option<usize> {
+    let output = record.model.outputs.first()?.tensor;
+    record.plan.order.iter().rposition(|&step| record.model.steps[step as usize].op.output() == output)
+}
+
 fn add_waypoint_errors(errors: &mut Vec<Spread>, frame: &FrameReport) {
-    let (Some(found), Some(expected)) = (&frame.waypoints, &frame.reference_waypoints) else { return };
-    errors.resize(found.len(), Spread::default());
-    for (spread, millimeters) in errors.iter_mut().zip(distances_mm(found, expected)) {
-        spread.add(millimeters);
+    errors.resize(errors.len().max(frame.waypoint_error_mm.len()), Spread::default());
+    for (spread, millimeters) in errors.iter_mut().zip(&frame.waypoint_error_mm) {
+        spread.add(*millimeters);
     }
 }
 
@@ -167,12 +239,13 @@ fn step_reports(record: &Record, figures: &[StepFigures]) -> Vec<StepReport> {
         StepReport {
             position,
             step: step.name.clone(),
-            op: step.op.name(),
+            op: step.op.name().into(),
             tensor: tensor.name.clone(),
             shape: [tensor.shape.height, tensor.shape.width, tensor.shape.channels],
-            element: codes::element_name(tensor.element),
+            element: codes::element_name(tensor.element).into(),
             scale: tensor.scale,
             zero_point: tensor.zero_point,
+            clip: codes::clip_range(tensor, &step.op),
             local_sqnr_db: figures.local.map(|sums| sums.sqnr_db()),
             sqnr_db: figures.accumulated.map(|sums| sums.sqnr_db()),
             cosine: figures.accumulated.map(|sums| sums.cosine()),
@@ -181,6 +254,8 @@ fn step_reports(record: &Record, figures: &[StepFigures]) -> Vec<StepReport> {
             headroom_bits: step.bounds.headroom_bits,
             bytes: elements * u64::from(tensor.element.bytes()),
             bytes_equal: figures.equal,
+            histogram: figures.histogram.clone(),
+            channels: figures.channels.as_ref().map(Channels::rounded),
         }
     };
     steps.zip(figures).enumerate().map(report).collect()
@@ -188,15 +263,22 @@ fn step_reports(record: &Record, figures: &[StepFigures]) -> Vec<StepReport> {
 
 fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread]) -> Summary {
     let plan = &record.plan;
+    let step = |position: Option<usize>| steps.get(position?);
+    let (vector, output) = (step(vector_position(record)), step(output_position(record)));
     Summary {
         steps: steps.len(),
         worst_step: worst(steps).map(|step| step.step.clone()),
         worst_sqnr_db: worst(steps).and_then(|step| step.sqnr_db),
+        vector_step: vector.map(|step| step.step.clone()),
+        vector_sqnr_db: vector.and_then(|step| step.sqnr_db),
+        output_step: output.map(|step| step.step.clone()),
+        output_sqnr_db: output.and_then(|step| step.sqnr_db),
         waypoint_error_mm: waypoint_errors.iter().map(|s| WaypointError { mean: s.mean(), max: s.max() }).collect(),
         arena_bytes: plan.arena_bytes,
         arena_bound_bytes: plan.bound_bytes,
         arena_status: plan.status,
         flash_bytes: 0,
+        accuracy: None,
     }
 }
 
@@ -204,6 +286,7 @@ fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread]) ->
 mod tests {
     use super::*;
     use crate::testing::{Sample, frame, graph, sample};
+    use model_compiler::error::ErrorCode;
     use std::fs;
 
     fn info() -> ModelInfo {
@@ -226,7 +309,10 @@ mod tests {
         for step in &report.steps {
             assert_eq!((step.local_sqnr_db, step.sqnr_db), (Some(f64::INFINITY), Some(f64::INFINITY)), "{}", step.step);
         }
-        assert_eq!((report.steps[1].op, report.steps[1].element, report.steps[1].bytes), ("average_pool", "i16", 6));
+        assert_eq!(
+            (&*report.steps[1].op, &*report.steps[1].element, report.steps[1].bytes),
+            ("average_pool", "i16", 6)
+        );
         assert_eq!(report.steps[0].saturation_ppm, None);
         assert_eq!(report.steps[1].saturation_ppm, Some(0.0));
     }
@@ -288,10 +374,12 @@ mod tests {
             record: None,
             model: None,
             import: ImportOptions::default(),
-            frames: FrameSource { frames: None, inputs: Some(path("inputs.safetensors")) },
+            frames: FrameSource { inputs: Some(path("inputs.safetensors")), ..FrameSource::default() },
             backend: Backend::choose(None).unwrap(),
             mirror: false,
-            min_sqnr_db: None,
+            gates: Gates::default(),
+            baseline: None,
+            noise: Selection::WhereCheap,
         };
         (folder, options)
     }
@@ -299,13 +387,13 @@ mod tests {
     #[test]
     fn files_are_verified_with_their_mirror_images() {
         let (_folder, mut options) = files(&sample());
-        let report = verify(&options, &ProgressBar::hidden()).unwrap();
+        let report = verify(&options, &ProgressBar::hidden()).unwrap().report;
         assert!(report.passed);
         assert_eq!((report.frames.len(), report.summary.flash_bytes), (2, sample().image.len() as u64));
         options.mirror = true;
-        let report = verify(&options, &ProgressBar::hidden()).unwrap();
+        let report = verify(&options, &ProgressBar::hidden()).unwrap().report;
         assert_eq!(report.frames[3].name, "inputs#1 (mirrored)");
-        options.min_sqnr_db = Some(10.0);
+        options.gates.min_sqnr_db = Some(10.0);
         let error = verify(&options, &ProgressBar::hidden()).unwrap_err();
         assert_eq!((error.code, error.help.as_str()), (ErrorCode::Usage, "add --model MODEL"));
     }

@@ -1,13 +1,18 @@
 //! Statistics of every graph value over the calibration frames, from the f32 reference.
 //!
-//! Two passes over the frames, in their given order: the first finds the extremes, the second fills a histogram between
-//! them. All sums are taken in f64 in a fixed order.
+//! Two passes over the frames: the first finds the extremes, the second fills a histogram between them. A few frames run
+//! side by side; sums are taken in f64 over each frame, then over the frames in their order, so the number of cores
+//! changes nothing.
 
 use crate::error::{Error, ErrorCode, Result};
 use crate::ir::{Graph, ValueId};
 use crate::reference;
+use rayon::prelude::*;
 
 const BINS: usize = 4096;
+
+/// Frames in memory at once. A single large one keeps all cores busy; small ones need company.
+const SIDE_BY_SIDE: usize = 8;
 
 /// Statistics of one value.
 #[derive(Clone, Debug, Default)]
@@ -59,6 +64,17 @@ impl ValueStatistics {
         }
     }
 
+    fn add_extremes(&mut self, other: &Self) {
+        if self.count == 0 {
+            self.clone_from(other);
+        } else if other.count > 0 {
+            self.count += other.count;
+            self.min = self.min.min(other.min);
+            self.max = self.max.max(other.max);
+            add(&mut self.channel_mean, &other.channel_mean);
+        }
+    }
+
     fn finish_extremes(&mut self, channels: usize) {
         let per_channel = (self.count as f64 / channels as f64).max(1.0);
         for mean in &mut self.channel_mean {
@@ -67,11 +83,12 @@ impl ValueStatistics {
         self.histogram = vec![0; BINS];
     }
 
-    fn see_distribution(&mut self, data: &[f32]) {
+    fn distribution(&self, data: &[f32]) -> Vec<u32> {
+        let mut histogram = vec![0; BINS];
         for &x in data.iter().filter(|x| **x != 0.0) {
-            let bin = self.bin_of(f64::from(x));
-            self.histogram[bin] += 1;
+            histogram[self.bin_of(f64::from(x))] += 1;
         }
+        histogram
     }
 }
 
@@ -105,36 +122,75 @@ pub fn calibrate(
     let total = 2 * frames.len();
     let mut values = vec![ValueStatistics::default(); graph.values.len()];
     let channels = |id: ValueId| usize::from(graph.value(id).shape.channels);
-    for (i, frame) in frames.iter().enumerate() {
+    let extremes = |i: usize, frame: &Vec<Vec<f32>>| {
+        let mut of_frame = vec![ValueStatistics::default(); graph.values.len()];
         let mut broken = None;
         reference::run(graph, frame, |node, data| {
             if broken.is_none() && data.iter().any(|x| !x.is_finite()) {
                 broken = Some(node.name.clone());
             }
-            values[node.output.0 as usize].see_extremes(data, channels(node.output));
+            of_frame[node.output.0 as usize].see_extremes(data, channels(node.output));
         })?;
-        if let Some(name) = broken {
-            return Err(Error::new(
+        match broken {
+            None => Ok(of_frame),
+            Some(name) => Err(Error::new(
                 ErrorCode::Numeric,
                 format!("calibration frame {i}, node {name}"),
                 "the f32 reference gives a value that is not finite",
             )
-            .with_help("look for extreme weights or inputs before this node"));
+            .with_help("look for extreme weights or inputs before this node")),
         }
-        progress(i + 1, total);
-    }
+    };
+    in_order(frames, extremes, |done, of_frame| {
+        values.iter_mut().zip(&of_frame).for_each(|(value, of_frame)| value.add_extremes(of_frame));
+        progress(done, total);
+    })?;
     for (index, value) in values.iter_mut().enumerate() {
         value.finish_extremes(channels(ValueId(index as u32)));
     }
-    for (i, frame) in frames.iter().enumerate() {
-        reference::run(graph, frame, |node, data| values[node.output.0 as usize].see_distribution(data))?;
-        progress(frames.len() + i + 1, total);
-    }
+    let mut histograms = vec![vec![0; BINS]; values.len()];
+    let distributions = |_: usize, frame: &Vec<Vec<f32>>| {
+        let mut of_frame = Vec::with_capacity(values.len());
+        reference::run(graph, frame, |node, data| {
+            let index = node.output.0 as usize;
+            of_frame.push((index, values[index].distribution(data)));
+        })?;
+        Ok(of_frame)
+    };
+    in_order(frames, distributions, |done, of_frame| {
+        for (index, histogram) in of_frame {
+            histograms[index].iter_mut().zip(histogram).for_each(|(sum, n)| *sum += u64::from(n));
+        }
+        progress(frames.len() + done, total);
+    })?;
+    values.iter_mut().zip(histograms).for_each(|(value, histogram)| value.histogram = histogram);
     Ok(Statistics { values })
 }
 
+/// Runs frames side by side and hands over their results in order, each with the number of those done. The first
+/// frame that fails ends it.
+fn in_order<T: Send>(
+    frames: &[Vec<Vec<f32>>],
+    run: impl Fn(usize, &Vec<Vec<f32>>) -> Result<T> + Sync,
+    mut take: impl FnMut(usize, T),
+) -> Result<()> {
+    for (chunk, together) in frames.chunks(SIDE_BY_SIDE).enumerate() {
+        let first = chunk * SIDE_BY_SIDE;
+        let results: Vec<Result<T>> = together.par_iter().enumerate().map(|(i, frame)| run(first + i, frame)).collect();
+        for (i, result) in results.into_iter().enumerate() {
+            take(first + i + 1, result?);
+        }
+    }
+    Ok(())
+}
+
+fn add(sums: &mut [f64], others: &[f64]) {
+    sums.iter_mut().zip(others).for_each(|(sum, other)| *sum += other);
+}
+
 /// Mean per channel of the values that quantized activations stand for: what clipping and rounding leave of each mean.
-/// `rounded` gives the nearest representable value; `None` leaves a value's float mean.
+/// `rounded` gives the nearest representable value; `None` leaves a value's float mean. `progress` is called after each
+/// frame with the number done and the total.
 ///
 /// # Errors
 /// As [`calibrate`].
@@ -142,30 +198,87 @@ pub fn quantized_means(
     graph: &Graph,
     frames: &[Vec<Vec<f32>>],
     statistics: &Statistics,
-    rounded: impl Fn(ValueId, f64) -> Option<f64>,
+    rounded: impl Fn(ValueId, f64) -> Option<f64> + Sync,
+    mut progress: impl FnMut(usize, usize),
 ) -> Result<Vec<Vec<f64>>> {
     let mut means: Vec<Vec<f64>> = statistics.values.iter().map(|v| v.channel_mean.clone()).collect();
     let is_rounded: Vec<bool> = (0..means.len()).map(|i| rounded(ValueId(i as u32), 0.0).is_some()).collect();
     for (mean, _) in means.iter_mut().zip(&is_rounded).filter(|(_, rounded)| **rounded) {
         mean.fill(0.0);
     }
-    for frame in frames {
+    let sums = |_: usize, frame: &Vec<Vec<f32>>| {
+        let mut of_frame = Vec::new();
         reference::run(graph, frame, |node, data| {
             let index = node.output.0 as usize;
             if !is_rounded[index] {
                 return;
             }
-            let sums = &mut means[index];
+            let mut sums = vec![0.0; statistics.values[index].channel_mean.len()];
             for position in data.chunks_exact(sums.len()) {
                 for (&x, sum) in position.iter().zip(sums.iter_mut()) {
                     *sum += rounded(node.output, f64::from(x)).unwrap_or(0.0);
                 }
             }
+            of_frame.push((index, sums));
         })?;
-    }
+        Ok(of_frame)
+    };
+    in_order(frames, sums, |done, of_frame| {
+        of_frame.iter().for_each(|(index, sums)| add(&mut means[*index], sums));
+        progress(done, frames.len());
+    })?;
     for (index, mean) in means.iter_mut().enumerate().filter(|(index, _)| is_rounded[*index]) {
         let per_channel = (statistics.values[index].count as f64 / mean.len() as f64).max(1.0);
         mean.iter_mut().for_each(|m| *m /= per_channel);
     }
     Ok(means)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::ir::{Clip, InputKind, Op, Shape};
+
+    /// `relu(x)`, `relu(x) + relu(x)` over two pixels of one channel.
+    fn graph() -> Graph {
+        let mut graph = Graph::default();
+        let x = graph.push_input("x", InputKind::Image, Shape::map(1, 2, 1));
+        let relu = graph.push("relu", Op::Clip(Clip::RELU), &[x]).unwrap();
+        let sum = graph.push("sum", Op::Add { clip: Clip::NONE }, &[relu, relu]).unwrap();
+        graph.outputs = vec![sum];
+        graph
+    }
+
+    /// Values whose sums are not exact.
+    fn frames(count: usize) -> Vec<Vec<Vec<f32>>> {
+        (0..count).map(|i| vec![vec![0.1 + i as f32 / 3.0, -1.0 / (i + 1) as f32]]).collect()
+    }
+
+    #[test]
+    fn statistics_do_not_depend_on_the_number_of_threads() {
+        let calibrated = |threads| {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            let mut done = Vec::new();
+            let statistics = pool.install(|| calibrate(&graph(), &frames(21), |d, t| done.push((d, t)))).unwrap();
+            assert_eq!(done, (1..=42).map(|d| (d, 42)).collect::<Vec<_>>());
+            statistics.values
+        };
+        let (one, four) = (calibrated(1), calibrated(4));
+        for (a, b) in one.iter().zip(&four) {
+            assert_eq!((a.min, a.max, a.count, &a.channel_mean), (b.min, b.max, b.count, &b.channel_mean));
+            assert_eq!(a.histogram, b.histogram);
+        }
+        let relu = &one[1];
+        assert_eq!((relu.min, relu.max, relu.count), (0.0, f64::from(0.1 + 20.0 / 3.0_f32), 42));
+        assert_eq!(relu.histogram.iter().sum::<u64>(), 21, "zeros are left out");
+    }
+
+    #[test]
+    fn the_first_broken_frame_is_named() {
+        let mut frames = frames(20);
+        frames[18][0][0] = f32::NAN;
+        frames[11][0][1] = f32::INFINITY;
+        let error = calibrate(&graph(), &frames, |_, _| {}).unwrap_err();
+        assert_eq!(error.location, "calibration frame 11, node x");
+    }
 }

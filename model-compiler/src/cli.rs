@@ -1,11 +1,12 @@
-//! The command line: `quantize`, `compile`, `inspect`.
+//! The command line: `quantize`, `compile`, `inspect`, `completions`.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
 use crate::artifact;
 use crate::error::{Error, ErrorCode, Result};
+use crate::frames::{self, FrameFormat};
 use crate::import::ImportOptions;
-use crate::ir::Graph;
+use crate::ir::{Graph, Normalization};
 use crate::memory_plan::PlanOptions;
 use crate::passes::PassOptions;
 use crate::pipeline;
@@ -13,35 +14,35 @@ use crate::qmodel::QModel;
 use crate::quantize::{QuantizeOptions, RangeRule, SkipStages};
 use crate::target::{Target, parse_size};
 use clap::{Args, Parser, Subcommand, ValueEnum};
-use indicatif::{ProgressBar, ProgressStyle};
 use std::ffi::OsString;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+mod completions;
 mod console;
+mod examples;
 mod inspect;
+mod progress;
 
+pub use completions::CompletionArgs;
 pub use console::Console;
+use progress::Bar;
+pub use progress::progress_bar;
 
 /// Trained driving networks to int8 model images.
 #[derive(Debug, Parser)]
-#[command(version, about, after_help = EXAMPLES)]
+#[command(version, about, after_help = examples::ALL)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
 }
 
-const EXAMPLES: &str = "Examples:
-  model-compiler compile transfuser.pth --calib frames/ --target cortex-m7 -o transfuser.img
-  model-compiler quantize transfuser.pth --calib inputs.safetensors --skip i16 -o transfuser.qmodel
-  model-compiler compile transfuser.qmodel --ram 1536K --flash 128M -o transfuser.img
-  model-compiler inspect transfuser.img";
-
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Checkpoint to quantized model (.qmodel): integers, scales and tables, independent of any target.
+    /// Checkpoint or ONNX file to quantized model (.qmodel): integers, scales and tables, independent of any target.
+    #[command(after_help = examples::QUANTIZE)]
     Quantize {
-        /// Checkpoint (.pth, .pt, .th, .safetensors).
+        /// Checkpoint (.pth, .pt, .th, .safetensors) or ONNX file.
         model: PathBuf,
         #[command(flatten)]
         quantize: QuantizeArgs,
@@ -49,9 +50,10 @@ enum Command {
         #[arg(short, long, value_name = "FILE.qmodel")]
         output: PathBuf,
     },
-    /// Quantized model or checkpoint to model image (OUT.img) and build record (OUT.record).
+    /// Quantized model, checkpoint or ONNX file to model image (OUT.img) and build record (OUT.record).
+    #[command(after_help = examples::COMPILE)]
     Compile {
-        /// Quantized model (.qmodel) or checkpoint.
+        /// Quantized model (.qmodel), checkpoint or ONNX file.
         model: PathBuf,
         #[command(flatten)]
         quantize: QuantizeArgs,
@@ -61,18 +63,24 @@ enum Command {
         #[arg(short, long, value_name = "OUT.img")]
         output: PathBuf,
     },
-    /// What is in a file: image, quantized model or checkpoint.
+    /// What is in a file: image, quantized model, checkpoint or ONNX file.
+    #[command(after_help = examples::INSPECT)]
     Inspect {
         /// The file.
         file: PathBuf,
     },
+    /// Script that completes commands and options in a shell.
+    #[command(after_help = examples::COMPLETIONS)]
+    Completions(CompletionArgs),
 }
 
 #[derive(Debug, Args)]
 struct QuantizeArgs {
-    /// Calibration frames: a frame directory or a .safetensors file of raw inputs.
+    /// Calibration frames: a frame directory (for classifiers: of images) or a .safetensors file of raw inputs.
     #[arg(long, value_name = "FRAMES|FILE")]
     calib: Option<PathBuf>,
+    #[command(flatten)]
+    resize: ResizeArgs,
     #[command(flatten)]
     import: ImportArgs,
     /// Skip values of the ResNets: i8, i16, or a list of 16-bit stages (0 is the stem).
@@ -81,6 +89,9 @@ struct QuantizeArgs {
     /// Clipping ranges of the i8 activations.
     #[arg(long, value_enum, default_value = "mse")]
     ranges: Ranges,
+    /// Round every weight to its nearest integer.
+    #[arg(long)]
+    no_data_aware_rounding: bool,
     /// Leave biases as they are.
     #[arg(long)]
     no_bias_correction: bool,
@@ -89,18 +100,45 @@ struct QuantizeArgs {
     max_velocity: f64,
 }
 
-/// How a checkpoint is read where its tensors cannot tell.
+/// How images of another size become a classifier's input.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Args)]
+pub struct ResizeArgs {
+    /// Scale every image of a classifier's directory to this shorter side, then crop its center; without it all have
+    /// the network's size. ImageNet networks: 256 for 224x224.
+    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u16).range(1..))]
+    pub resize: Option<u16>,
+}
+
+/// How a checkpoint or an ONNX file is read where it cannot tell.
 #[derive(Debug, Args)]
 pub struct ImportArgs {
-    /// System; detected from the tensor names unless given.
+    /// System of a checkpoint; detected from the tensor names unless given.
     #[arg(long, value_name = "SYSTEM")]
     system: Option<String>,
-    /// Attention heads (no tensor tells).
-    #[arg(long, default_value_t = 4, value_parser = clap::value_parser!(u16).range(1..))]
-    heads: u16,
-    /// Height and width of the network's image and BEV inputs; told from the tensors where they tell it, else 256x256.
+    /// Attention heads of a checkpoint (no tensor tells) [default: 4].
+    #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
+    heads: Option<u16>,
+    /// Height and width of the network's image and BEV inputs; told from the file where it tells it, else 256x256 for
+    /// a checkpoint; an ONNX file of dynamic size needs it.
     #[arg(long, value_name = "HxW")]
     resolution: Option<Resolution>,
+    /// Mean of an ONNX network's image, one value or one per channel: the network reads (grey level * SCALE - MEAN) /
+    /// STD [default: ImageNet's 0.485,0.456,0.406 for RGB, 0 for grey].
+    #[arg(
+        long,
+        value_name = "R,G,B",
+        value_delimiter = ',',
+        value_parser = finite,
+        allow_hyphen_values = true,
+        requires = "std"
+    )]
+    mean: Option<Vec<f64>>,
+    /// Standard deviation, like --mean [default: ImageNet's 0.229,0.224,0.225 for RGB, 1 for grey].
+    #[arg(long, value_name = "R,G,B", value_delimiter = ',', value_parser = positive, requires = "mean")]
+    std: Option<Vec<f64>>,
+    /// Factor of the grey levels before --mean and --std: a number or a fraction [default: 1/255].
+    #[arg(long, value_parser = fraction, requires = "mean")]
+    scale: Option<f64>,
 }
 
 /// `HEIGHTxWIDTH`.
@@ -122,6 +160,18 @@ impl std::str::FromStr for Resolution {
 fn positive(text: &str) -> std::result::Result<f64, String> {
     let value = text.parse::<f64>().ok().filter(|v| v.is_finite() && *v > 0.0);
     value.ok_or_else(|| format!("found {text:?}, expected a positive number"))
+}
+
+fn finite(text: &str) -> std::result::Result<f64, String> {
+    text.parse::<f64>().ok().filter(|v| v.is_finite()).ok_or_else(|| format!("found {text:?}, expected a number"))
+}
+
+/// A positive number, or two of them as `A/B`.
+fn fraction(text: &str) -> std::result::Result<f64, String> {
+    match text.split_once('/') {
+        None => positive(text),
+        Some((above, below)) => Ok(positive(above)? / positive(below)?),
+    }
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -160,7 +210,15 @@ impl ImportArgs {
     pub fn options(&self) -> Result<ImportOptions> {
         let system = self.system.as_deref().map(str::parse).transpose();
         let system = system.map_err(|e: Error| e.within("--system"))?;
-        Ok(ImportOptions { system, heads: self.heads, resolution: self.resolution.map(|Resolution(h, w)| (h, w)) })
+        let resolution = self.resolution.map(|Resolution(h, w)| (h, w));
+        Ok(ImportOptions { system, heads: self.heads, resolution, normalization: self.normalization() })
+    }
+
+    /// `(x·scale − mean)/std` in grey levels.
+    fn normalization(&self) -> Option<Normalization> {
+        let scale = self.scale.unwrap_or(1.0 / 255.0);
+        let raw = |values: &[f64]| values.iter().map(|v| (v / scale) as f32).collect();
+        Some(Normalization { mean: raw(self.mean.as_ref()?), std: raw(self.std.as_ref()?) })
     }
 }
 
@@ -173,6 +231,7 @@ impl QuantizeArgs {
                 Ranges::Minmax => RangeRule::MinMax,
             },
             bias_correction: !self.no_bias_correction,
+            data_aware_rounding: !self.no_data_aware_rounding,
             max_velocity: self.max_velocity,
             ..QuantizeOptions::default()
         }
@@ -183,12 +242,15 @@ impl QuantizeArgs {
     }
 
     fn quantized(&self, path: &Path, bar: &mut Bar) -> Result<QModel> {
+        bar.show("import", 0, 1);
         let graph = self.graph(path)?;
         let calib = self.calib.as_deref().ok_or_else(|| {
-            Error::new(ErrorCode::Usage, path.display().to_string(), "a checkpoint needs calibration frames")
+            Error::new(ErrorCode::Usage, path.display().to_string(), "this model needs calibration frames")
                 .with_help("add --calib FRAMES (a frame directory or a .safetensors file of raw inputs)")
         })?;
-        let frames = pipeline::load_frames(&graph, calib)?;
+        bar.show("load frames", 0, 1);
+        let format = FrameFormat { resize: self.resize.resize, ..FrameFormat::of_graph(&graph) };
+        let frames = frames::load(calib, &format)?;
         pipeline::quantize_graph(&graph, &frames, &self.options(), &mut |s, d, t| bar.show(s, d, t))
     }
 }
@@ -216,7 +278,7 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
             return 0;
         }
     };
-    let mut bar = Bar::new();
+    let mut bar = Bar::default();
     let result = cli.command.execute(&mut bar, &mut console);
     bar.finish();
     match result {
@@ -240,6 +302,7 @@ impl Command {
                 run_compile(model, quantize, target, output, bar, console)
             }
             Self::Inspect { file } => inspect::inspect(file),
+            Self::Completions(shell) => Ok(shell.script::<Cli>()),
         }
     }
 }
@@ -319,25 +382,28 @@ fn is_quantized(path: &Path) -> Result<bool> {
     Ok(artifact::is::<QModel>(&head))
 }
 
-/// A progress bar on standard error, drawn only on a terminal.
-struct Bar(ProgressBar);
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::CommandFactory;
 
-impl Bar {
-    fn new() -> Self {
-        let bar = ProgressBar::new(1);
-        if let Ok(style) = ProgressStyle::with_template("{msg:>10} [{bar:40}] {pos}/{len} {elapsed}") {
-            bar.set_style(style);
+    #[test]
+    fn the_definition_is_consistent() {
+        Cli::command().debug_assert();
+    }
+
+    #[test]
+    fn every_command_has_examples_and_they_parse() {
+        let program = Cli::command();
+        for command in std::iter::once(&program).chain(program.get_subcommands()) {
+            let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let examples: Vec<&str> = help.lines().filter_map(|line| line.strip_prefix("  ")).collect();
+            assert!(!examples.is_empty(), "{} has no examples", command.get_name());
+            for example in examples {
+                let words: Vec<&str> = example.split_whitespace().collect();
+                Cli::try_parse_from(&words).unwrap_or_else(|e| panic!("{example}: {e}"));
+                assert!(command.get_name() == "model-compiler" || words[1] == command.get_name(), "{example}");
+            }
         }
-        Self(bar)
-    }
-
-    fn show(&mut self, stage: &str, done: usize, total: usize) {
-        self.0.set_length(total as u64);
-        self.0.set_position(done as u64);
-        self.0.set_message(stage.to_owned());
-    }
-
-    fn finish(&self) {
-        self.0.finish_and_clear();
     }
 }

@@ -1,8 +1,9 @@
 //! Camera, LiDAR, speed and goal of one moment, as a network reads them: for calibration and for evaluation.
 //!
-//! Two sources give the same [`Frame`]:
+//! Three sources give the same [`Frame`]:
 //! * a **frame directory** `FRAMES/<name>/{rgb.png, lidar.bin, frame.json}`: sensor data, prepared here ([`camera`],
 //!   [`bev`]) by the rules that the networks were trained with
+//! * an **image directory**, for classifiers: PNG or JPEG files and, optionally, their labels ([`images`])
 //! * a **tensor file** (`.safetensors`) of ready network inputs, first dimension = frames
 //!
 //! What has to be present follows from the network ([`FrameFormat`]); the rest may be missing.
@@ -17,13 +18,23 @@ use std::path::Path;
 pub mod bev;
 pub mod camera;
 mod directory;
+pub mod images;
+pub mod labels;
 mod tensors;
 
+pub use labels::Label;
+
 /// Which inputs a network reads, and how its LiDAR histogram is cut.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct FrameFormat {
-    /// RGB image `H×W×3`.
+    /// Image `H×W×3`, or `H×W×1` where a classifier reads grey levels.
     pub image: Option<Shape>,
+    /// What a classifier calls its image input; driving systems call it `rgb`.
+    pub image_name: String,
+    /// Number of classes, if the network is a classifier: it reads one image and gives a vector.
+    pub classes: Option<u16>,
+    /// A classifier's images are scaled to this shorter side and cropped; without it they have the network's size.
+    pub resize: Option<u16>,
     /// LiDAR histogram `lateral×longitudinal×2`.
     pub bev: Option<Shape>,
     /// Forward speed.
@@ -37,8 +48,16 @@ pub struct FrameFormat {
 impl FrameFormat {
     /// The format of a network of this system with these inputs.
     pub fn new(system: &str, inputs: impl IntoIterator<Item = (InputKind, Shape)>) -> Self {
-        let mut format =
-            Self { image: None, bev: None, velocity: false, goal: false, split_height_m: split_height_m(system) };
+        let mut format = Self {
+            image: None,
+            image_name: input_name(InputKind::Image).into(),
+            classes: None,
+            resize: None,
+            bev: None,
+            velocity: false,
+            goal: false,
+            split_height_m: split_height_m(system),
+        };
         for (kind, shape) in inputs {
             match kind {
                 InputKind::Image => format.image = Some(shape),
@@ -50,15 +69,30 @@ impl FrameFormat {
         format
     }
 
+    /// The same, of a classifier if there is nothing but one image to read and the first output is a vector.
+    #[must_use]
+    pub fn with_output(mut self, image_name: &str, output: Option<Shape>) -> Self {
+        let reads_only_an_image = self.image.is_some() && self.bev.is_none() && !self.velocity && !self.goal;
+        self.classes = output.filter(|s| reads_only_an_image && (s.height, s.width) == (1, 1)).map(|s| s.channels);
+        if self.classes.is_some() {
+            self.image_name = image_name.into();
+        }
+        self
+    }
+
     /// The format that a float graph reads.
     pub fn of_graph(graph: &Graph) -> Self {
-        Self::new(&graph.system, graph.inputs().map(|(id, kind)| (kind, graph.value(id).shape)))
+        let format = Self::new(&graph.system, graph.inputs().map(|(id, kind)| (kind, graph.value(id).shape)));
+        let name = graph.inputs().next().map_or("", |(id, _)| &graph.value(id).name);
+        format.with_output(name, graph.outputs.first().map(|&id| graph.value(id).shape))
     }
 
     /// The format that a quantized model reads.
     pub fn of_model(model: &QModel) -> Self {
         let inputs = model.inputs.iter().filter_map(|port| Some((port.kind?, model.tensor(port.tensor).shape)));
+        let name = model.inputs.first().map_or("", |port| &port.name);
         Self::new(&model.system, inputs)
+            .with_output(name, model.outputs.first().map(|port| model.tensor(port.tensor).shape))
     }
 }
 
@@ -79,12 +113,12 @@ pub struct ByteMap {
     pub data: Vec<u8>,
 }
 
-/// One moment of driving.
-#[derive(Clone, Debug, PartialEq)]
+/// One moment of driving, or one image to classify.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Frame {
-    /// Folder name, or `FILE#INDEX`.
+    /// Folder or file name, or `FILE#INDEX`.
     pub name: String,
-    /// RGB image `H×W×3`, 0..=255, cropped to the network's size.
+    /// Image `H×W×3` (or `H×W×1`), 0..=255, of the network's size.
     pub rgb: Option<ByteMap>,
     /// LiDAR counts 0..=5, `lateral×longitudinal×2`; rows from right to left, columns from far to near.
     pub bev: Option<ByteMap>,
@@ -96,6 +130,8 @@ pub struct Frame {
     pub command: Option<u8>,
     /// LiDAR points with a coordinate that is not finite; they are left out.
     pub dropped_points: usize,
+    /// What is to be seen, where somebody said so.
+    pub label: Option<Label>,
 }
 
 impl Frame {
@@ -161,16 +197,25 @@ pub fn input_name(kind: InputKind) -> &'static str {
     }
 }
 
-/// Loads frames: a directory is a frame directory, a file is a tensor file.
+/// Loads frames: a directory is a frame directory (of a classifier: of images), a file is a tensor file.
 ///
 /// # Errors
 /// Anything missing, damaged or misshapen, with its file and field; no frame at all.
 pub fn load(path: &Path, format: &FrameFormat) -> Result<Vec<Frame>> {
-    let metadata = std::fs::metadata(path).map_err(|e| {
-        Error::io(path, &e)
-            .with_help("frames are a directory FRAMES/<name>/{rgb.png, lidar.bin, frame.json} or a .safetensors file")
-    })?;
-    if metadata.is_dir() { directory::load(path, format) } else { tensors::load(path, format) }
+    let help = match format.classes {
+        None => "frames are a directory FRAMES/<name>/{rgb.png, lidar.bin, frame.json} or a .safetensors file",
+        Some(_) => "frames are a directory of images, optionally with labels.csv, or a .safetensors file",
+    };
+    let metadata = std::fs::metadata(path).map_err(|e| Error::io(path, &e).with_help(help))?;
+    match (metadata.is_dir(), format.classes) {
+        (true, Some(classes)) => images::load(path, format, classes),
+        _ if format.resize.is_some() => {
+            let error = Error::new(ErrorCode::Usage, path.display().to_string(), "nothing here can be scaled");
+            Err(error.with_help("leave --resize out: it is for directories of images to classify"))
+        }
+        (true, None) => directory::load(path, format),
+        (false, _) => tensors::load(path, format),
+    }
 }
 
 /// Names of the evaluation frames that are also among the calibration frames, given by their short digests.
@@ -214,7 +259,7 @@ mod tests {
             velocity: Some(3.5),
             goal: Some([1.0, -20.0]),
             command: Some(1),
-            dropped_points: 0,
+            ..Frame::default()
         }
     }
 
@@ -255,5 +300,18 @@ mod tests {
         assert!(late.goal && !late.velocity && late.image.is_none());
         assert_eq!(late.split_height_m, 2.0);
         assert_eq!(FrameFormat::new("transfuser", []).split_height_m, -2.0);
+    }
+
+    #[test]
+    fn a_classifier_reads_one_image_and_gives_a_vector() {
+        let camera = (InputKind::Image, Shape::map(32, 32, 3));
+        let goal = (InputKind::Goal, Shape::vector(2));
+        let classes = |inputs: &[(InputKind, Shape)], output| {
+            FrameFormat::new("", inputs.iter().copied()).with_output("x", output).classes
+        };
+        assert_eq!(classes(&[camera], Some(Shape::vector(10))), Some(10));
+        assert_eq!(classes(&[camera], Some(Shape::map(4, 1, 2))), None, "waypoints");
+        assert_eq!(classes(&[camera, goal], Some(Shape::vector(10))), None);
+        assert_eq!(classes(&[camera], None), None);
     }
 }

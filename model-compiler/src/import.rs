@@ -1,17 +1,20 @@
-//! From a checkpoint's tensors to the float graph.
+//! From a file to the float graph: a checkpoint's tensors, or an ONNX model ([`onnx`]).
 //!
 //! The readers ([`checkpoint`]) give [`NamedTensors`]; the system is told from the names; every size of the network
 //! (channels, blocks, fusion scales, transformer layers, hidden sizes) from the shapes; the graph that comes out stays
 //! close to the framework's modules and carries their names. A checkpoint that does not fit is refused with one list
 //! of all its tensors that are missing, surplus, misshapen or not finite.
 
+use crate::artifact::folder_of;
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::Graph;
+use crate::ir::{Graph, Normalization};
 use std::collections::BTreeMap;
 use std::ops::Bound;
+use std::path::Path;
 use std::str::FromStr;
 
 pub mod checkpoint;
+pub mod onnx;
 mod systems;
 
 /// Elements of a checkpoint tensor.
@@ -158,22 +161,39 @@ impl FromStr for System {
     }
 }
 
-/// What cannot be told from the tensors.
-#[derive(Clone, Debug, PartialEq, Eq)]
+/// What cannot be told from the file.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct ImportOptions {
-    /// The system; detected from the tensor names when absent.
+    /// Checkpoints: the system; detected from the tensor names when absent.
     pub system: Option<System>,
-    /// Attention heads of the transformers.
-    pub heads: u16,
+    /// Checkpoints: attention heads of the transformers; 4 when absent.
+    pub heads: Option<u16>,
     /// Height and width of camera image and LiDAR histogram, pixels. When absent: 32 pixels per token where a square
-    /// positional embedding tells the token grid, else 256×256.
+    /// positional embedding tells the token grid, else 256×256; for ONNX what the file says.
     pub resolution: Option<(u16, u16)>,
+    /// ONNX: mean and deviation of the image in grey levels 0..=255, one value for all channels or one for each. When
+    /// absent: ImageNet's for three channels, 0 and 255 (so 0..1) for one.
+    pub normalization: Option<Normalization>,
 }
 
-impl Default for ImportOptions {
-    fn default() -> Self {
-        Self { system: None, heads: 4, resolution: None }
+/// Builds the float graph of a file, a checkpoint or an ONNX model, told by its content.
+///
+/// # Errors
+/// `Io` where the file cannot be read, those of its reader, of [`import`] and of [`onnx::import`], all naming the file;
+/// `Usage` for an option that belongs to the other kind of file.
+pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
+    let name = path.display().to_string();
+    let bytes = checkpoint::read_bounded(path)?;
+    if onnx::is_onnx(&bytes) {
+        let model = onnx::Model::parse(bytes).map_err(|e| e.within(&name))?;
+        return onnx::import(&model, Some(folder_of(path)), options).map_err(|e| e.within(&name));
     }
+    if options.normalization.is_some() {
+        return Err(Error::new(ErrorCode::Usage, name, "--mean, --std and --scale have no effect on a checkpoint")
+            .with_help("leave them out; the normalization belongs to the system"));
+    }
+    let tensors = checkpoint::parse(&bytes).map_err(|e| e.within(&name))?.into();
+    import(&name, tensors, options)
 }
 
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.

@@ -14,12 +14,15 @@
 
 mod arithmetic;
 mod attention;
+mod concat;
+mod copy_box;
 mod inputs;
 mod layer_norm;
 mod operands;
 mod pool;
 mod rescale;
 mod resize_bilinear;
+mod softmax;
 mod sum;
 #[cfg(test)]
 mod testing;
@@ -141,13 +144,29 @@ fn dispatch(operands: &Operands, op: &QOp) -> Result<Vec<f64>> {
             layer_norm::layer_norm(operands, *input, usize::from(*first_row), *output, &affine, &requantizer)
         }
         QOp::Attention { query, key, value, output, heads, exponent, exp_table, requant, zero_point, clamp } => {
-            let softmax = attention::Softmax::new(*exponent, exp_table)?;
+            let softmax = softmax::Exponential::new(*exponent, exp_table)?;
             let requantizer = Requantizer::new(requant.shift, *zero_point, *clamp);
             let context = attention::Context { multiplier: f64::from(requant.multiplier), requantizer };
             let tensors = attention::Tensors { query: *query, key: *key, value: *value, output: *output };
             attention::attention(operands, &tensors, usize::from(*heads), &softmax, &context)
         }
         QOp::WaypointDecoder(decoder) => waypoint_decoder::waypoint_decoder(operands, decoder),
+        QOp::CopyBox { input, output, begin, stride, size, before, border } => {
+            let axis = |k: usize| copy_box::Span::new(begin[k], stride[k], size[k], before[k]);
+            copy_box::copy_box(operands, *input, *output, [axis(0), axis(1), axis(2)], *border)
+        }
+        QOp::Concat { first, second, output, axis, zero_point, clamp } => {
+            let sources = [first, second].map(|source| concat::Source {
+                tensor: source.tensor,
+                zero_point: f64::from(source.zero_point),
+                multiplier: f64::from(source.requant.multiplier),
+                requantizer: Requantizer::new(source.requant.shift, *zero_point, *clamp),
+            });
+            concat::concat(operands, &sources, *axis, *output)
+        }
+        QOp::Softmax { input, output, exponent, exp_table } => {
+            softmax::softmax(operands, *input, *output, &softmax::Exponential::new(*exponent, exp_table)?)
+        }
     }
 }
 

@@ -11,6 +11,7 @@
 //! fuse it ([`crate::passes`]). Both forms run on the reference interpreter. A fused node keeps the name of the last
 //! node of its chain, so a value is found under the same name before and after.
 
+pub use firmware::program::Axis;
 use firmware::program::Window;
 pub use firmware::tensor::Shape;
 use std::sync::Arc;
@@ -43,7 +44,7 @@ pub struct Value {
 /// What a graph input holds, in raw units.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub enum InputKind {
-    /// RGB image, values 0..=255.
+    /// RGB or grey image, values 0..=255.
     Image,
     /// LiDAR histogram: counts 0..=5; the network sees counts / 5.
     Bev,
@@ -51,6 +52,28 @@ pub enum InputKind {
     Velocity,
     /// Goal point `[right, forward-negative]`, m.
     Goal,
+}
+
+/// Bounds of a result: `min(max(x, min), max)`. ReLU is `0..∞`, ReLU6 `0..6`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Clip {
+    /// Smallest result; may be −∞.
+    pub min: f32,
+    /// Largest result; may be ∞.
+    pub max: f32,
+}
+
+impl Clip {
+    /// No bounds.
+    pub const NONE: Self = Self { min: f32::NEG_INFINITY, max: f32::INFINITY };
+    /// `max(x, 0)`.
+    pub const RELU: Self = Self { min: 0.0, max: f32::INFINITY };
+
+    /// This clip, then `next`, as one.
+    #[must_use]
+    pub fn then(self, next: Self) -> Self {
+        Self { min: self.min.clamp(next.min, next.max), max: self.max.clamp(next.min, next.max) }
+    }
 }
 
 /// Per-channel `(x − mean) / std` in raw input units.
@@ -75,8 +98,8 @@ pub struct Conv2d {
     pub groups: u16,
     /// Normalization of the raw input, folded in.
     pub normalization: Option<Arc<Normalization>>,
-    /// ReLU at the end (after the residual, if there is one).
-    pub relu: bool,
+    /// Bounds at the end (after the residual, if there is one).
+    pub clip: Clip,
 }
 
 /// Matrix product over the channels.
@@ -86,8 +109,8 @@ pub struct Linear {
     pub weights: Arc<Weights>,
     /// Per output.
     pub bias: Option<Arc<Vec<f32>>>,
-    /// ReLU at the end (after the residual, if there is one).
-    pub relu: bool,
+    /// Bounds at the end (after the residual, if there is one).
+    pub clip: Clip,
 }
 
 /// Inference batch norm: `(x − mean)·weight/√(var + eps) + bias`.
@@ -134,6 +157,28 @@ pub struct LayerNorm {
     pub grid: (u16, u16),
 }
 
+/// A strided box of a map: `out[i] = in[begin + i·stride]` along height, width and channels, up to `end` (exclusive).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Slice {
+    /// First index per axis.
+    pub begin: [u16; 3],
+    /// Index behind the last per axis.
+    pub end: [u16; 3],
+    /// Distance of neighbors per axis, at least 1.
+    pub stride: [u16; 3],
+}
+
+/// A map with a border of one value, along height, width and channels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Pad {
+    /// Elements before the map per axis.
+    pub before: [u16; 3],
+    /// Elements behind the map per axis.
+    pub after: [u16; 3],
+    /// Value of the border.
+    pub value: f32,
+}
+
 /// GRU cell and output layer, run `steps` times (spec 1.0). Inputs: hidden state, goal. Output `steps × 1 × 2`.
 #[derive(Clone, Debug)]
 pub struct WaypointDecoder {
@@ -164,12 +209,12 @@ pub enum Op {
     Conv2d(Conv2d),
     /// `[map]`.
     BatchNorm(BatchNorm),
-    /// `[x]`.
-    Relu,
-    /// `[a, b]`, same shape; optional ReLU.
+    /// `[x]`: bounds.
+    Clip(Clip),
+    /// `[a, b]`, same shape.
     Add {
-        /// ReLU at the end.
-        relu: bool,
+        /// Bounds at the end.
+        clip: Clip,
     },
     /// `[map]`; padding never wins.
     MaxPool(Window),
@@ -195,6 +240,14 @@ pub enum Op {
     },
     /// `[hidden, goal]`.
     WaypointDecoder(WaypointDecoder),
+    /// `[map]`.
+    Slice(Slice),
+    /// `[map]`.
+    Pad(Pad),
+    /// `[map, map, …]`, one after the other along an axis; equal in the other two.
+    Concat(Axis),
+    /// `[x]`: `exp(x) / Σ exp(x)` over the channels of each position.
+    Softmax,
 }
 
 /// One operator application.
@@ -281,7 +334,13 @@ impl Op {
             Self::Normalize(_) => "normalize",
             Self::Conv2d(_) => "conv2d",
             Self::BatchNorm(_) => "batch_norm",
-            Self::Relu => "relu",
+            Self::Clip(clip) => {
+                if *clip == Clip::RELU {
+                    "relu"
+                } else {
+                    "clip"
+                }
+            }
             Self::Add { .. } => "add",
             Self::MaxPool(_) => "max_pool",
             Self::AveragePool(_) => "average_pool",
@@ -292,6 +351,10 @@ impl Op {
             Self::LayerNorm(_) => "layer_norm",
             Self::Attention { .. } => "attention",
             Self::WaypointDecoder(_) => "waypoint_decoder",
+            Self::Slice(_) => "slice",
+            Self::Pad(_) => "pad",
+            Self::Concat(_) => "concat",
+            Self::Softmax => "softmax",
         }
     }
 

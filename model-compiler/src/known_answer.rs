@@ -15,11 +15,11 @@ use firmware::tensor::ElementType;
 /// Seed of every image: a start-up test needs inputs that move all codes, not new ones.
 const SEED: u64 = 0x6b6e_6f77_6e21;
 
-/// Runs the f64 model on the seeded inputs.
+/// Runs the f64 model on the seeded inputs. `progress` is called after each step with the number done and the total.
 ///
 /// # Errors
 /// An intermediate exceeds the bounds of the arithmetic (a defect of the quantizer).
-pub fn known_answer(model: &QModel, plan: &MemoryPlan) -> Result<KnownAnswer> {
+pub fn known_answer(model: &QModel, plan: &MemoryPlan, mut progress: impl FnMut(usize, usize)) -> Result<KnownAnswer> {
     let mut generator = Generator::new(SEED);
     let inputs: Vec<Vec<f64>> = model
         .inputs
@@ -34,6 +34,7 @@ pub fn known_answer(model: &QModel, plan: &MemoryPlan) -> Result<KnownAnswer> {
     let mut crcs = vec![0; model.steps.len()];
     integer_reference::run(model, &inputs, |index, step, codes| {
         crcs[index] = crc32(&integer_reference::to_bytes(codes, model.tensor(step.op.output()).element));
+        progress(index + 1, model.steps.len());
     })?;
     let step_crcs = plan.order.iter().map(|&index| crcs[index as usize]).collect();
     Ok(KnownAnswer { seed: SEED, step_crcs })

@@ -44,6 +44,7 @@ pub struct Placement {
 
 /// What is known about the distance of a plan from the best one (for its order and in-place choices).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum PlanStatus {
     /// The arena equals the lower bound.
     Optimal,

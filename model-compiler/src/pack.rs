@@ -6,12 +6,15 @@ use crate::artifact;
 use crate::emit::{ConstantsBuilder, ImageParts, ImagePort};
 use crate::error::{Error, ErrorCode, Result};
 use crate::memory_plan::{MemoryPlan, Placement};
-use crate::qmodel::{Port, QModel, QOp, QRescale, QResidual, QTensorId, QTerm, QTokenSource, QWaypointDecoder};
+use crate::qmodel::{
+    Port, QConcatSource, QModel, QOp, QRescale, QResidual, QTensorId, QTerm, QTokenSource, QWaypointDecoder,
+};
 use firmware::image::TensorRecord;
 use firmware::kernels::{k4n16, plan};
 use firmware::program::{
-    Add, Attention, AveragePool, ConstRange, Conv2d, GlobalPool, KernelId, LayerNorm, Linear, MaxPool, Requantize,
-    Rescale, Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, WaypointDecoder,
+    Add, Attention, AveragePool, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GlobalPool, KernelId, LayerNorm,
+    Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, Step, Term, TokenSource, Tokens,
+    WaypointDecoder,
 };
 use firmware::tensor::TensorId;
 
@@ -84,6 +87,11 @@ fn term(term: &QTerm) -> Result<Term> {
 fn token_source(source: &QTokenSource) -> Result<TokenSource> {
     let QTokenSource { map, zero_point, pool_h, pool_w, multiplier } = *source;
     Ok(TokenSource { map: tensor_id(map)?, zero_point, pool_h, pool_w, multiplier })
+}
+
+fn concat_source(source: &QConcatSource) -> Result<ConcatSource> {
+    let QConcatSource { tensor, zero_point, requant } = *source;
+    Ok(ConcatSource { tensor: tensor_id(tensor)?, zero_point, requant })
 }
 
 struct Packer {
@@ -264,6 +272,29 @@ impl Packer {
                 })
             }
             QOp::WaypointDecoder(decoder) => Step::WaypointDecoder(self.waypoint_decoder(decoder, scratch)?),
+            QOp::CopyBox { input, output, begin, stride, size, before, border } => Step::CopyBox(CopyBox {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                begin: *begin,
+                stride: *stride,
+                size: *size,
+                before: *before,
+                border: *border,
+            }),
+            QOp::Concat { first, second, output, axis, zero_point, clamp } => Step::Concat(Concat {
+                first: concat_source(first)?,
+                second: concat_source(second)?,
+                output: tensor_id(*output)?,
+                axis: *axis,
+                zero_point: *zero_point,
+                clamp: *clamp,
+            }),
+            QOp::Softmax { input, output, exponent, exp_table } => Step::Softmax(Softmax {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                exponent: *exponent,
+                exp_table: self.constants.push(exp_table)?,
+            }),
         })
     }
 

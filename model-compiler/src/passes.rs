@@ -7,14 +7,20 @@ use crate::error::{Error, ErrorCode, Result};
 use crate::ir::Graph;
 use crate::ir::verify::verify;
 
+mod clip_before_pool;
 mod dead_code;
 #[cfg(test)]
 mod fixture;
 mod fold_batch_norm;
+mod fold_batch_norm_forward;
 mod fold_normalization;
+mod fold_padding;
 mod fuse_activation;
 mod fuse_residual;
+mod lower_batch_norm;
+mod lower_normalization;
 mod rewrite;
+mod split_concat;
 
 /// Switches of the passes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,11 +50,17 @@ pub fn optimize(graph: &mut Graph) -> Result<()> {
 /// `Numeric`: what the verifier found, such as a folded weight that exceeds the range of `f32`.
 pub fn optimize_with(graph: &mut Graph, options: PassOptions) -> Result<()> {
     type Pass<'a> = &'a dyn Fn(&mut Graph);
-    let passes: [(&str, Pass<'_>); 5] = [
-        ("fold_normalization", &fold_normalization::run),
+    let passes: [(&str, Pass<'_>); 11] = [
+        ("fold_padding", &fold_padding::run),
         ("fold_batch_norm", &fold_batch_norm::run),
+        ("fold_batch_norm_forward", &fold_batch_norm_forward::run),
+        ("lower_batch_norm", &lower_batch_norm::run),
+        ("fold_normalization", &fold_normalization::run),
+        ("lower_normalization", &lower_normalization::run),
         ("fuse_residual", &|graph| fuse_residual::run(graph, options.fuse_residual)),
+        ("clip_before_pool", &clip_before_pool::run),
         ("fuse_activation", &fuse_activation::run),
+        ("split_concat", &split_concat::run),
         ("dead_code", &dead_code::run),
     ];
     for (name, pass) in passes {

@@ -5,7 +5,7 @@ use crate::calibrate::calibrate;
 use crate::emit::emit;
 use crate::error::{Error, ErrorCode, Result};
 use crate::frames::{self, Frame, FrameFormat};
-use crate::import::{self, ImportOptions, checkpoint};
+use crate::import::{self, ImportOptions};
 use crate::ir::Graph;
 use crate::known_answer::known_answer;
 use crate::memory_plan::{self, PlanOptions};
@@ -20,14 +20,13 @@ use std::path::Path;
 /// Where the stages report how far they are: stage name, units done, units in all.
 pub type Progress<'a> = &'a mut dyn FnMut(&str, usize, usize);
 
-/// A checkpoint as an optimized float graph.
+/// A checkpoint or ONNX file as an optimized float graph.
 ///
 /// # Errors
-/// Unreadable file, unknown system, wrong tensors; the file is named.
+/// Those of [`import::read`]; the file is named.
 pub fn load_graph(path: &Path, import: &ImportOptions, passes: &PassOptions) -> Result<Graph> {
     let name = path.display().to_string();
-    let tensors = checkpoint::read(path)?.into();
-    let mut graph = import::import(&name, tensors, import)?;
+    let mut graph = import::read(path, import)?;
     graph.name = path.file_stem().map_or(name.clone(), |stem| stem.to_string_lossy().into_owned());
     passes::optimize_with(&mut graph, *passes).map_err(|e| e.within(name))?;
     Ok(graph)
@@ -54,14 +53,14 @@ pub fn quantize_graph(
     let inputs = raw_inputs(graph, calibration)?;
     let statistics = calibrate(graph, &inputs, |done, total| progress("calibrate", done, total))?;
     progress("quantize", 0, 1);
-    let mut model = quantize(graph, &inputs, &statistics, options)?;
-    progress("quantize", 1, 1);
+    let mut model = quantize(graph, &inputs, &statistics, options, |done, total| progress("quantize", done, total))?;
     let digests: Vec<String> = calibration.iter().map(Frame::short_digest).collect();
     model.provenance = vec![
         ("calibration_frames".into(), digests.join(",")),
         ("skip_stages".into(), options.skip.to_string()),
         ("ranges".into(), format!("{:?}", options.ranges)),
         ("bias_correction".into(), options.bias_correction.to_string()),
+        ("data_aware_rounding".into(), options.data_aware_rounding.to_string()),
         ("wide_stream".into(), options.wide_stream.to_string()),
         ("own_pool_scale".into(), options.own_pool_scale.to_string()),
         ("max_velocity".into(), options.max_velocity.to_string()),
@@ -98,9 +97,9 @@ pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress:
             .with_help("this is a defect of the planner")
     })?;
     progress("plan", 1, 1);
-    progress("emit", 0, 1);
     let mut parts = pack(model, &plan)?;
-    parts.known_answer = Some(known_answer(model, &plan)?);
+    parts.known_answer = Some(known_answer(model, &plan, |done, total| progress("known answer", done, total))?);
+    progress("emit", 0, 1);
     let image = emit(&parts)?;
     target.fits(model, &plan, image.len() as u64)?;
     progress("emit", 1, 1);

@@ -5,7 +5,7 @@
 //! numerics (the one arithmetic); arrays here are plain vectors in canonical order.
 
 use crate::ir::InputKind;
-use firmware::program::{Clamp, Requant, Window};
+use firmware::program::{Axis, Clamp, Requant, Window};
 use firmware::tensor::{ElementType, Shape};
 use serde::{Deserialize, Serialize};
 
@@ -84,6 +84,9 @@ pub struct Bounds {
     pub headroom_bits: u8,
     /// `max |t_k|·2^-(n+1)`: rounding of the multipliers, in output LSB.
     pub multiplier_rounding: f64,
+    /// Whether the output's smallest and largest code stand for bounds of the network (ReLU, clip): codes there are no
+    /// loss.
+    pub clipped: [bool; 2],
 }
 
 /// See [`firmware::program::Rescale`].
@@ -132,6 +135,15 @@ pub struct QTokenSource {
     pub pool_h: u8,
     pub pool_w: u8,
     pub multiplier: i32,
+}
+
+/// See [`firmware::program::ConcatSource`].
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[allow(missing_docs, reason = "field for field the image's")]
+pub struct QConcatSource {
+    pub tensor: QTensorId,
+    pub zero_point: i16,
+    pub requant: Requant,
 }
 
 /// The GRU decoder's integers; see [`firmware::program::WaypointDecoder`].
@@ -270,6 +282,30 @@ pub enum QOp {
         clamp: Clamp,
     },
     WaypointDecoder(QWaypointDecoder),
+    CopyBox {
+        input: QTensorId,
+        output: QTensorId,
+        begin: [u16; 3],
+        stride: [u16; 3],
+        size: [u16; 3],
+        before: [u16; 3],
+        border: i16,
+    },
+    Concat {
+        first: QConcatSource,
+        second: QConcatSource,
+        output: QTensorId,
+        axis: Axis,
+        zero_point: i16,
+        clamp: Clamp,
+    },
+    Softmax {
+        input: QTensorId,
+        output: QTensorId,
+        exponent: Requant,
+        /// 257 entries.
+        exp_table: Vec<i16>,
+    },
 }
 
 impl QModel {
@@ -295,6 +331,31 @@ impl QOp {
             Self::LayerNorm { .. } => "layer_norm",
             Self::Attention { .. } => "attention",
             Self::WaypointDecoder(_) => "waypoint_decoder",
+            Self::CopyBox { .. } => "copy_box",
+            Self::Concat { .. } => "concat",
+            Self::Softmax { .. } => "softmax",
+        }
+    }
+
+    /// Whether the operator bounds its output codes; the others copy codes or give fixed point.
+    pub fn has_clamp(&self) -> bool {
+        !matches!(self, Self::MaxPool { .. } | Self::CopyBox { .. } | Self::Softmax { .. } | Self::WaypointDecoder(_))
+    }
+
+    /// Bounds of the output code.
+    pub fn clamp_mut(&mut self) -> Option<&mut Clamp> {
+        match self {
+            Self::Conv2d { rescale, .. } | Self::Linear { rescale, .. } => Some(&mut rescale.clamp),
+            Self::AveragePool { clamp, .. }
+            | Self::GlobalPool { clamp, .. }
+            | Self::Add { clamp, .. }
+            | Self::Requantize { clamp, .. }
+            | Self::ResizeBilinear { clamp, .. }
+            | Self::Tokens { clamp, .. }
+            | Self::LayerNorm { clamp, .. }
+            | Self::Attention { clamp, .. }
+            | Self::Concat { clamp, .. } => Some(clamp),
+            Self::MaxPool { .. } | Self::CopyBox { .. } | Self::Softmax { .. } | Self::WaypointDecoder(_) => None,
         }
     }
 
@@ -324,11 +385,14 @@ impl QOp {
             Self::MaxPool { input, .. }
             | Self::AveragePool { input, .. }
             | Self::Requantize { input, .. }
-            | Self::LayerNorm { input, .. } => vec![*input],
+            | Self::LayerNorm { input, .. }
+            | Self::CopyBox { input, .. }
+            | Self::Softmax { input, .. } => vec![*input],
             Self::GlobalPool { first, second, .. } => {
                 std::iter::once(first.tensor).chain(second.map(|t| t.tensor)).collect()
             }
             Self::Add { first, second, .. } => vec![first.tensor, second.tensor],
+            Self::Concat { first, second, .. } => vec![first.tensor, second.tensor],
             Self::ResizeBilinear { input, residual, .. } => {
                 std::iter::once(input.tensor).chain(residual.map(|t| t.tensor)).collect()
             }
@@ -351,7 +415,10 @@ impl QOp {
             | Self::ResizeBilinear { output, .. }
             | Self::Tokens { output, .. }
             | Self::LayerNorm { output, .. }
-            | Self::Attention { output, .. } => *output,
+            | Self::Attention { output, .. }
+            | Self::CopyBox { output, .. }
+            | Self::Concat { output, .. }
+            | Self::Softmax { output, .. } => *output,
             Self::WaypointDecoder(d) => d.output,
         }
     }

@@ -6,19 +6,28 @@
 
 use crate::calibrate::{self, Statistics};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Graph, Node, Op, ValueId};
+use crate::ir::{Conv2d, Graph, Node, Op, Shape, ValueId};
 use crate::qmodel::{Bounds, Port, QModel, QOp, QStep, QTensor, QTensorId};
-use firmware::program::Clamp;
+use covariance::Covariances;
+use firmware::program::{Clamp, Window};
 use firmware::tensor::ElementType;
 use serde::{Deserialize, Serialize};
 use std::collections::HashMap;
 use std::fmt;
 
+mod bounds;
+mod copies;
+mod covariance;
 mod decoder;
 pub mod factors;
+mod moves;
 pub mod ranges;
+mod rounding;
+mod softmax;
 mod sums;
 pub mod tables;
+#[cfg(test)]
+mod tests;
 mod token;
 pub mod types;
 mod weighted;
@@ -97,6 +106,8 @@ pub struct QuantizeOptions {
     pub ranges: RangeRule,
     /// Correct biases for the mean error of quantized weights.
     pub bias_correction: bool,
+    /// Round weights so that their errors cancel on the calibration frames, where these say enough about a layer.
+    pub data_aware_rounding: bool,
     /// Residual stream of the transformers in 16 bits.
     pub wide_stream: bool,
     /// Global pools get a scale of their own instead of their input's.
@@ -111,6 +122,7 @@ impl Default for QuantizeOptions {
             skip: SkipStages::narrow(),
             ranges: RangeRule::Mse,
             bias_correction: true,
+            data_aware_rounding: true,
             wide_stream: true,
             own_pool_scale: true,
             max_velocity: 10.0,
@@ -119,6 +131,7 @@ impl Default for QuantizeOptions {
 }
 
 /// Quantizes an optimized graph with the statistics of its calibration frames (raw inputs per frame, in graph order).
+/// `progress` is called after each frame that the bias correction looks at with the number done and the total.
 ///
 /// # Errors
 /// An operator without an integer form, or an intermediate that exceeds its type or 2^53; the node is named.
@@ -127,16 +140,23 @@ pub fn quantize(
     frames: &[Vec<Vec<f32>>],
     statistics: &Statistics,
     options: &QuantizeOptions,
+    progress: impl FnMut(usize, usize),
 ) -> Result<QModel> {
     let types = types::assign(graph, statistics, options)?;
-    let quantized_means = calibrate::quantized_means(graph, frames, statistics, |value, x| {
+    let rounded = |value, x| {
         let stored = types.narrow(value);
         (options.bias_correction && stored.element == ElementType::I8).then(|| stored.rounded(x))
-    })?;
+    };
+    let quantized_means = calibrate::quantized_means(graph, frames, statistics, rounded, progress)?;
+    let covariances = match options.data_aware_rounding {
+        true => Covariances::measure(graph, frames, &types)?,
+        false => Covariances::default(),
+    };
     let mut builder = Builder {
         graph,
         statistics,
         quantized_means,
+        covariances,
         options,
         types,
         model: QModel {
@@ -167,6 +187,8 @@ struct Builder<'a> {
     statistics: &'a Statistics,
     /// Mean per channel of each value as the layers read it.
     quantized_means: Vec<Vec<f64>>,
+    /// How what the layers read varies.
+    covariances: Covariances,
     options: &'a QuantizeOptions,
     types: types::Types,
     model: QModel,
@@ -193,13 +215,18 @@ impl Builder<'_> {
             }
             Op::AveragePool(window) => self.average_pool(node, window),
             Op::GlobalPool => self.global_pool(node),
-            Op::Add { relu } => self.add(node, *relu),
+            Op::Add { clip } => self.add(node, *clip),
             Op::ResizeBilinear { factor } => self.resize_bilinear(node, *factor),
             Op::Tokens(tokens) => self.tokens(node, tokens),
             Op::LayerNorm(norm) => self.layer_norm(node, norm),
             Op::Attention { heads } => self.attention(node, *heads),
             Op::WaypointDecoder(decoder) => self.waypoint_decoder(node, decoder),
-            Op::Normalize(_) | Op::BatchNorm(_) | Op::Relu => Err(Error::new(
+            Op::Slice(slice) => self.slice(node, slice),
+            Op::Pad(pad) => self.pad(node, pad),
+            Op::Concat(axis) => self.concat(node, *axis),
+            Op::Clip(clip) => self.clip(node, *clip),
+            Op::Softmax => self.softmax(node),
+            Op::Normalize(_) | Op::BatchNorm(_) => Err(Error::new(
                 ErrorCode::Unsupported,
                 "",
                 format!("{} stands alone and has no integer form", node.op.name()),
@@ -219,10 +246,44 @@ impl Builder<'_> {
         id
     }
 
+    /// The tensor of a value that must be stored as codes.
+    fn codes(&mut self, value: ValueId) -> Result<QTensorId> {
+        let id = self.tensor(value);
+        if matches!(self.model.tensor(id).element, ElementType::I8 | ElementType::I16) {
+            return Ok(id);
+        }
+        let place = format!("operand {}", self.graph.value(value).name);
+        Err(Error::new(ErrorCode::Unsupported, place, "found 32-bit fixed point, expected 8- or 16-bit codes"))
+    }
+
+    /// The step that computes the operand of `node`, where nothing else reads that operand and it is stored like the
+    /// result: it becomes the step of `node`, and the caller adds what the node does. None where `suits` declines it.
+    fn take_over(&mut self, node: &Node, suits: impl Fn(&QOp) -> bool) -> Option<usize> {
+        let (operand, result) = (node.inputs[0], node.output);
+        let alike = self.types.of(operand).holds_like(self.types.of(result));
+        if !alike || copies::use_counts(self.graph)[operand.0 as usize] != 1 {
+            return None;
+        }
+        let id = *self.stored.get(&operand)?;
+        let index = self.model.steps.iter().rposition(|step| step.op.output() == id && suits(&step.op))?;
+        let taken = self.qtensor(node.name.clone(), result, *self.types.of(result));
+        self.model.tensors[id.0 as usize] = taken;
+        self.stored.insert(result, id);
+        self.model.steps[index].name.clone_from(&node.name);
+        self.model.steps[index].node = Some(node.name.clone());
+        Some(index)
+    }
+
     fn add_tensor(&mut self, name: String, value: ValueId, stored: types::Stored) -> QTensorId {
         let id = QTensorId(self.model.tensors.len() as u32);
+        let tensor = self.qtensor(name, value, stored);
+        self.model.tensors.push(tensor);
+        id
+    }
+
+    fn qtensor(&self, name: String, value: ValueId, stored: types::Stored) -> QTensor {
         let source = self.graph.value(value);
-        self.model.tensors.push(QTensor {
+        QTensor {
             name,
             value: source.name.clone(),
             shape: source.shape,
@@ -230,8 +291,7 @@ impl Builder<'_> {
             scale: stored.scale,
             zero_point: stored.zero_point,
             saturation_ppm: stored.saturation_ppm,
-        });
-        id
+        }
     }
 
     /// A value as i8: itself, or a copy made by an extra step where it is stored in 16 bits.
@@ -273,18 +333,19 @@ impl Builder<'_> {
         self.model.tensor(id).zero_point as i16
     }
 
-    /// Bounds of an output code; ReLU raises the lower one to the zero point.
-    fn clamp(&self, id: QTensorId, relu: bool) -> Clamp {
-        let (min, max) = code_range(self.model.tensor(id).element);
-        Clamp { min: if relu { self.zero_point(id).max(min) } else { min }, max }
-    }
-
     /// Largest `|q − z|` of a tensor.
     fn magnitude(&self, id: QTensorId) -> f64 {
         let (min, max) = code_range(self.model.tensor(id).element);
         let z = f64::from(self.zero_point(id));
         (f64::from(max) - z).max(z - f64::from(min))
     }
+}
+
+/// Whether a convolution is the matrix product of one position, which takes 16-bit codes as they are.
+fn is_linear(conv: &Conv2d, input: Shape) -> bool {
+    let Window { kernel_h, kernel_w, pad_top, pad_bottom, pad_left, pad_right, .. } = conv.window;
+    let alone = [kernel_h, kernel_w, pad_top, pad_bottom, pad_left, pad_right] == [1, 1, 0, 0, 0, 0];
+    alone && input.positions() == 1 && conv.groups == 1 && conv.normalization.is_none()
 }
 
 /// Smallest and largest code of an element type that activations use.
@@ -298,6 +359,7 @@ fn bounds_of(accumulator_bits: u32, products: &[f64], multiplier_rounding: f64) 
     let accumulator_spare = if accumulator_bits > 31 { 63 - accumulator_bits } else { 31 - accumulator_bits };
     Bounds {
         accumulator_bits: accumulator_bits as u8,
+        clipped: [false; 2],
         headroom_bits: accumulator_spare.min(53u32.saturating_sub(product_bits)) as u8,
         multiplier_rounding,
     }

@@ -15,9 +15,13 @@ mod layer_norm;
 mod linear;
 mod matmul;
 mod pool;
+mod rerun;
 mod resize_bilinear;
+mod slice;
 mod tokens;
 mod waypoint_decoder;
+
+pub use rerun::{Change, rerun};
 
 #[cfg(test)]
 mod testing;
@@ -94,14 +98,14 @@ pub fn evaluate(op: &Op, input_shapes: &[Shape], inputs: &[&[f32]], output_shape
         Op::Normalize(n) => elementwise::normalize(n, inputs[0]),
         Op::Conv2d(conv) => conv2d::conv2d(conv, input_shapes[0], inputs, output_shape),
         Op::BatchNorm(bn) => elementwise::batch_norm(bn, inputs[0]),
-        Op::Relu => {
+        Op::Clip(bounds) => {
             let mut out = inputs[0].to_vec();
-            elementwise::relu(&mut out);
+            elementwise::clip(&mut out, *bounds);
             out
         }
-        Op::Add { relu } => {
+        Op::Add { clip } => {
             let mut out = inputs[0].to_vec();
-            elementwise::finish(&mut out, None, Some(inputs[1]), *relu);
+            elementwise::finish(&mut out, None, Some(inputs[1]), *clip);
             out
         }
         Op::MaxPool(window) => pool::max_pool(window, input_shapes[0], inputs[0], output_shape),
@@ -115,6 +119,10 @@ pub fn evaluate(op: &Op, input_shapes: &[Shape], inputs: &[&[f32]], output_shape
         Op::LayerNorm(norm) => layer_norm::layer_norm(norm, inputs[0]),
         Op::Attention { heads } => attention::attention(*heads, output_shape, inputs),
         Op::WaypointDecoder(decoder) => waypoint_decoder::waypoint_decoder(decoder, inputs),
+        Op::Slice(s) => slice::slice(s, input_shapes[0], inputs[0]),
+        Op::Pad(pad) => slice::pad(pad, input_shapes[0], inputs[0], output_shape),
+        Op::Concat(axis) => slice::concat(*axis, input_shapes, inputs),
+        Op::Softmax => elementwise::softmax(inputs[0], usize::from(output_shape.channels)),
     }
 }
 

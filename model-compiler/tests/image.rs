@@ -48,8 +48,18 @@ fn sample_is_accepted() {
     }
     let goal = image.input(3).expect("four inputs");
     assert_eq!((goal.name, goal.tensor.0, goal.scale), ("goal", ids::GOAL, 0.5));
-    assert!(image.input(4).is_none() && image.output(1).is_none());
+    assert!(image.input(4).is_none() && image.output(2).is_none());
     assert_eq!(image.output(0).expect("one output").name, "waypoints");
+}
+
+#[test]
+fn work_is_the_sum_over_the_steps() {
+    let bytes = sample();
+    let image = Image::parse(&bytes).expect("parses");
+    let work: Vec<u64> = (0..image.step_count()).filter_map(|position| image.step_work(position)).collect();
+    assert_eq!((work.len(), work.iter().sum::<u64>()), (STEPS, image.work()));
+    assert!(work.iter().all(|&work| work > 0), "{work:?}");
+    assert_eq!(image.step_work(image.step_count()), None);
 }
 
 #[test]
@@ -303,7 +313,7 @@ fn engine_refuses_wrong_use() {
     assert_eq!(engine.output(0), Err(EngineError::NotDone));
     engine.infer(&slices).expect("runs");
     assert_eq!(engine.step(), Ok(Progress::Done));
-    assert_eq!(engine.output(1), Err(EngineError::NoSuchOutput(1)));
+    assert_eq!(engine.output(2), Err(EngineError::NoSuchOutput(2)));
     assert_eq!(engine.output(0).expect("done").len(), 32);
 }
 

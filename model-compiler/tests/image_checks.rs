@@ -81,7 +81,7 @@ fn header_changes() -> Vec<(Check, Change)> {
         (Check::HeaderReserved, Sealed(|b| b[header::RESERVED_B.end - 1] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::REGIONS.end - 1] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::SECTIONS.end - 1] = 1)),
-        (Check::Features, Sealed(|b| b[header::FEATURES.start + 1] |= 0x10)),
+        (Check::Features, Sealed(|b| b[header::FEATURES.start + 1] |= 0x80)),
         (Check::Features, Sealed(|b| b[header::FEATURES.start + 4] |= 4)),
         (Check::Features, Sealed(|b| b[header::FEATURES.end - 1] |= 0x80)),
         (Check::StepCount, Sealed(|b| b[header::STEP_COUNT].fill(0))),
@@ -112,7 +112,13 @@ fn section_changes() -> Vec<(Check, Change)> {
         (Check::SectionLength, Sealed(|b| b[slot(SectionKind::KnownAnswer) + section::LENGTH.start] ^= 4)),
         (Check::SectionEnd, Sealed(|b| b[slot(SectionKind::Constants) + section::LENGTH.start + 3] = 1)),
         (Check::SectionEnd, Sealed(|b| put_u32(b, slot(SectionKind::KnownAnswer) + section::LENGTH.start, 0))),
-        (Check::SectionPadding, Sealed(|b| *b.last_mut().expect("not empty") = 1)),
+        (
+            Check::SectionPadding,
+            Sealed(|b| {
+                let behind_step_index = start(b, SectionKind::Program) - 1;
+                b[behind_step_index] = 1;
+            }),
+        ),
         (
             Check::SectionCrc,
             Raw(|b| {
@@ -309,6 +315,7 @@ fn memory_changes() -> Vec<(Check, Change)> {
         (Check::ConstLength, Parts(|p| step!(p, at::LAYER_NORM, LayerNorm, |s| s.gains.bytes -= 4))),
         (Check::ConstLength, Parts(|p| step!(p, at::LAYER_NORM, LayerNorm, |s| s.offsets.bytes -= 8))),
         (Check::ConstLength, Parts(|p| step!(p, at::ATTENTION, Attention, |s| s.exp_table.bytes -= 2))),
+        (Check::ConstLength, Parts(|p| step!(p, at::SOFTMAX, Softmax, |s| s.exp_table.bytes -= 2))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.concat = true))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.tanh_table.bytes -= 2))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.biases.bytes -= 8))),
@@ -398,6 +405,37 @@ fn operator_changes() -> Vec<(Check, Change)> {
         (Check::StepHeads, Parts(|p| step!(p, at::ATTENTION, Attention, |s| s.heads = 0))),
         (Check::StepHeads, Parts(|p| *p = attention_alone(4, 1026, 2))),
         (Check::StepFraction, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.hidden_fraction_bits = 16))),
+        (
+            Check::StepElement,
+            Parts(|p| {
+                to_fresh_memory(p, &[ids::PROBABILITIES]);
+                let probabilities = record(p, ids::PROBABILITIES);
+                (probabilities.in_place_of, probabilities.element) = (None, ElementType::I8);
+                probabilities.bytes /= 2;
+            }),
+        ),
+        (Check::StepShape, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.axis = Axis::Width))),
+        (Check::StepShape, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.axis = Axis::Channels))),
+        (Check::StepShape, Parts(|p| record(p, ids::JOINED).shape = Shape::map(4, 7, 8))),
+        (Check::StepShape, Parts(|p| record(p, ids::PROBABILITIES).shape = Shape::map(4, 7, 8))),
+        (Check::StepZeroPoint, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.second.zero_point = 128))),
+        (Check::StepZeroPoint, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.zero_point = 1))),
+        (Check::StepClamp, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.clamp = Clamp { min: 1, max: 0 }))),
+        (Check::StepMultiplier, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.first.requant.multiplier = 1))),
+        (Check::StepShift, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.second.requant.shift = 0))),
+        (Check::StepShift, Parts(|p| step!(p, at::SOFTMAX, Softmax, |s| s.exponent.shift = 53))),
+        (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.begin[0] = 2))),
+        (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.stride[2] = 6))),
+        (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.stride[1] = 0))),
+        (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.size[1] = 0))),
+        (
+            Check::StepBox,
+            Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| (s.size, s.stride) = ([u16::MAX; 3], [u16::MAX; 3]))),
+        ),
+        (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.before[2] = 7))),
+        (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.before[0] = u16::MAX))),
+        (Check::StepBorder, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.border = -129))),
+        (Check::StepChannels, Parts(|p| *p = softmax_alone(32769))),
         (Check::Work, Parts(|p| *p = endless_convolution())),
     ]
 }
@@ -414,6 +452,28 @@ fn wide_hidden_state(parts: &mut ImageParts) {
         s.rescale.multipliers.bytes = 4100;
         s.rescale.shifts.bytes = 1025;
     });
+}
+
+/// One softmax over an input.
+fn softmax_alone(channels: u16) -> ImageParts {
+    let mut parts = attention_alone(8, 8, 2);
+    let bytes = 2 * u32::from(channels);
+    let (element, shape) = (ElementType::I16, Shape::vector(channels));
+    let tensor = |offset| TensorRecord { element, shape, offset, bytes, ..parts.tensors[0] };
+    let behind = bytes.next_multiple_of(16);
+    parts.tensors = vec![tensor(0), tensor(behind)];
+    parts.arena_bytes = 2 * behind;
+    parts.inputs = vec![port("x", 0)];
+    parts.outputs = vec![port("y", 1)];
+    step!(parts, 0, Attention, |s| {
+        parts.steps = vec![Step::Softmax(Softmax {
+            input: TensorId(0),
+            output: TensorId(1),
+            exponent: s.exponent,
+            exp_table: s.exp_table,
+        })];
+    });
+    parts
 }
 
 /// Three inputs and one attention.

@@ -48,6 +48,7 @@ pub fn frames((height, width): (u16, u16)) -> Vec<Frame> {
                 goal: Some(frame.target.map(f64::from)),
                 command: Some(frame.command as u8),
                 dropped_points: 0,
+                label: None,
             }
         })
         .collect()

@@ -9,7 +9,8 @@ use firmware::tensor::Shape;
 use model_compiler::emit::{AlignedBytes, ImageParts, KnownAnswer};
 use model_compiler::frames::{ByteMap, Frame};
 use model_compiler::ir::{
-    Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Tokens, ValueId, WaypointDecoder, Weights,
+    Axis, Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Pad, Slice, Tokens, ValueId,
+    WaypointDecoder, Weights,
 };
 use model_compiler::pack::pack;
 use model_compiler::pipeline::{self, Compiled};
@@ -25,7 +26,7 @@ const CHANNELS: usize = 4;
 const SIZE: u16 = 16;
 
 /// Names of all operators, as [`firmware::program::Step::name`] gives them.
-pub const OPERATORS: [&str; 12] = [
+pub const OPERATORS: [&str; 15] = [
     "conv2d",
     "linear",
     "max_pool",
@@ -38,6 +39,9 @@ pub const OPERATORS: [&str; 12] = [
     "layer_norm",
     "attention",
     "waypoint_decoder",
+    "copy_box",
+    "concat",
+    "softmax",
 ];
 
 /// The float network.
@@ -51,19 +55,20 @@ pub fn graph() -> Graph {
     let velocity = b.graph.push_input("velocity", InputKind::Velocity, Shape::vector(1));
     let goal = b.graph.push_input("goal", InputKind::Goal, Shape::vector(2));
     let image = b.image_branch(rgb);
-    let stem = b.conv("lidar.stem", &[bev], Window::square(3, 2, 1), 1, None, true);
+    let stem = b.conv("lidar.stem", &[bev], Window::square(3, 2, 1), 1, None, Clip::RELU);
     let lidar = b.push("lidar.pool", Op::AveragePool(Window::square(2, 2, 0)), &[stem]);
     let [image_tokens, lidar_tokens] = b.transformer(image, lidar, velocity);
     let enlarged = Op::ResizeBilinear { factor: (2, 2) };
     let image = b.push("image.fused", enlarged.clone(), &[image_tokens, image]);
     let lidar_tokens = b.push("lidar.enlarged", enlarged, &[lidar_tokens]);
-    let lidar = b.push("lidar.fused", Op::Add { relu: true }, &[lidar, lidar_tokens]);
+    let lidar = b.push("lidar.fused", Op::Add { clip: Clip::RELU }, &[lidar, lidar_tokens]);
     let features = b.push("features", Op::GlobalPool, &[image, lidar]);
-    let joined = b.linear("join.0", &[features], 6, true);
-    let hidden = b.linear("join.2", &[joined], CHANNELS, false);
+    let joined = b.linear("join.0", &[features], 6, Clip::RELU);
+    let hidden = b.linear("join.2", &[joined], CHANNELS, Clip::NONE);
     let decoder = b.decoder();
     let waypoints = b.push("waypoints", decoder, &[hidden, goal]);
-    b.graph.outputs.push(waypoints);
+    let probabilities = b.classifier(image, lidar, bev);
+    b.graph.outputs.extend([waypoints, probabilities]);
     b.graph
 }
 
@@ -83,6 +88,7 @@ pub fn frames(seed: u64, count: usize) -> Vec<Frame> {
         goal: Some([2.0 - i as f64, -8.0 - 3.0 * i as f64]),
         command: None,
         dropped_points: 0,
+        label: None,
     };
     (0..count).map(frame).collect()
 }
@@ -167,7 +173,7 @@ impl Builder {
         window: Window,
         groups: u16,
         normalization: Option<Normalization>,
-        relu: bool,
+        clip: Clip,
     ) -> ValueId {
         let depth = self.channels(inputs[0]) / usize::from(groups);
         let conv = Conv2d {
@@ -176,14 +182,14 @@ impl Builder {
             window,
             groups,
             normalization: normalization.map(Arc::new),
-            relu,
+            clip,
         };
         self.push(name, Op::Conv2d(conv), inputs)
     }
 
-    fn linear(&mut self, name: &str, inputs: &[ValueId], outputs: usize, relu: bool) -> ValueId {
+    fn linear(&mut self, name: &str, inputs: &[ValueId], outputs: usize, clip: Clip) -> ValueId {
         let depth = self.channels(inputs[0]);
-        let linear = Linear { weights: self.weights(&[outputs, depth]), bias: Some(self.bias(outputs)), relu };
+        let linear = Linear { weights: self.weights(&[outputs, depth]), bias: Some(self.bias(outputs)), clip };
         self.push(name, Op::Linear(linear), inputs)
     }
 
@@ -196,10 +202,10 @@ impl Builder {
     /// Strided stem, padded max pool, a residual block with a grouped convolution.
     fn image_branch(&mut self, rgb: ValueId) -> ValueId {
         let normalization = Normalization { mean: vec![124.0, 116.0, 104.0], std: vec![58.0, 57.0, 57.5] };
-        let stem = self.conv("image.stem", &[rgb], Window::square(3, 2, 1), 1, Some(normalization), false);
+        let stem = self.conv("image.stem", &[rgb], Window::square(3, 2, 1), 1, Some(normalization), Clip::NONE);
         let pooled = self.push("image.pool", Op::MaxPool(Window::square(3, 2, 1)), &[stem]);
-        let grouped = self.conv("image.conv1", &[pooled], Window::square(3, 1, 1), 2, None, true);
-        self.conv("image.conv2", &[grouped, pooled], Window::square(3, 1, 1), 1, None, true)
+        let grouped = self.conv("image.conv1", &[pooled], Window::square(3, 1, 1), 2, None, Clip::RELU);
+        self.conv("image.conv2", &[grouped, pooled], Window::square(3, 1, 1), 1, None, Clip::RELU)
     }
 
     /// One layer over four tokens of each branch; returns the normalized maps of both.
@@ -212,13 +218,34 @@ impl Builder {
         };
         let x = self.push("tokens", Op::Tokens(tokens), &[image, lidar, velocity]);
         let normed = self.layer_norm("ln1", x, 0, (8, 1));
-        let heads = ["query", "key", "value"].map(|name| self.linear(name, &[normed], CHANNELS, false));
+        let heads = ["query", "key", "value"].map(|name| self.linear(name, &[normed], CHANNELS, Clip::NONE));
         let context = self.push("attention", Op::Attention { heads: 2 }, &heads);
-        let x = self.linear("proj", &[context, x], CHANNELS, false);
+        let x = self.linear("proj", &[context, x], CHANNELS, Clip::NONE);
         let normed = self.layer_norm("ln2", x, 0, (8, 1));
-        let mlp = self.linear("mlp.0", &[normed], 8, true);
-        let x = self.linear("mlp.2", &[mlp, x], CHANNELS, false);
+        let mlp = self.linear("mlp.0", &[normed], 8, Clip::RELU);
+        let x = self.linear("mlp.2", &[mlp, x], CHANNELS, Clip::NONE);
         [("ln_f.image", 0), ("ln_f.lidar", 4)].map(|(name, first_row)| self.layer_norm(name, x, first_row, (2, 2)))
+    }
+
+    /// Every other pixel of one map in a border of channels (the shortcut without weights), bordered pixels of the
+    /// other within bounds, both joined; probabilities per pixel of that, and of a corner of an input.
+    fn classifier(&mut self, image: ValueId, lidar: ValueId, bev: ValueId) -> ValueId {
+        let every_other = Slice { begin: [1, 0, 1], end: [4, 4, 4], stride: [2, 2, 1] };
+        let sliced = self.push("class.slice", Op::Slice(every_other), &[image]);
+        let channels = Pad { before: [0, 0, 2], after: [0; 3], value: 0.0 };
+        let shortcut = self.push("class.shortcut", Op::Pad(channels), &[sliced]);
+        let pooled = self.push("class.pool", Op::MaxPool(Window::square(4, 1, 0)), &[lidar]);
+        let pixels = Pad { before: [1, 0, 0], after: [0, 1, 0], value: 0.25 };
+        let padded = self.push("class.pad", Op::Pad(pixels), &[pooled]);
+        let clipped = self.push("class.clip", Op::Clip(Clip { min: 0.125, max: 1.0 }), &[padded]);
+        let joined = self.push("class.join", Op::Concat(Axis::Channels), &[shortcut, clipped]);
+        let logits = self.conv("class.logits", &[joined], Window::square(1, 1, 0), 1, None, Clip::NONE);
+        let probabilities = self.push("class.softmax", Op::Softmax, &[logits]);
+        let corner = Slice { begin: [6, 6, 0], end: [8, 8, 2], stride: [1; 3] };
+        let counts = self.push("class.corner", Op::Slice(corner), &[bev]);
+        let counts = self.push("class.counts", Op::Pad(channels), &[counts]);
+        let counts = self.push("class.likely", Op::Softmax, &[counts]);
+        self.push("class.probabilities", Op::Concat(Axis::Width), &[probabilities, counts])
     }
 
     fn decoder(&mut self) -> Op {
@@ -239,7 +266,8 @@ mod tests {
     use super::*;
     use firmware::engine::Engine;
     use firmware::kernels::Portable;
-    use firmware::program::{Residual, Step};
+    use firmware::program::{Requant, Residual, Step};
+    use firmware::tensor::{ElementType, TensorId};
     use model_compiler::emit::emit;
 
     #[test]
@@ -261,6 +289,19 @@ mod tests {
         assert!(forms(&|s| matches!(s, Step::ResizeBilinear(s) if s.residual.is_some())));
         assert!(forms(&|s| matches!(s, Step::ResizeBilinear(s) if s.residual.is_none())));
         assert!(forms(&|s| matches!(s, Step::LayerNorm(s) if s.first_row > 0)));
+        let element = |id: TensorId| parts.tensors[usize::from(id.0)].element;
+        assert!(
+            forms(&|s| matches!(s, Step::CopyBox(s) if s.stride[0] > 1 && s.before[2] > 0)),
+            "slice and pad in one"
+        );
+        assert!(forms(&|s| matches!(s, Step::CopyBox(s) if s.stride == [1; 3] && s.begin == [0; 3])), "pad alone");
+        assert!(forms(&|s| matches!(s, Step::Concat(s) if s.axis == Axis::Channels)));
+        assert!(forms(&|s| matches!(s, Step::Concat(s) if s.axis == Axis::Width)));
+        let exact = Requant { multiplier: 1 << 23, shift: 23 };
+        assert!(forms(&|s| matches!(s, Step::Concat(s) if s.second.requant == exact)), "moved");
+        assert!(forms(&|s| matches!(s, Step::Concat(s) if s.first.requant != exact)), "rescaled");
+        assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I16)));
+        assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I8)));
         let in_place = parts.tensors.iter().filter(|tensor| tensor.in_place_of.is_some()).count();
         assert!(in_place >= 3, "{in_place} tensors in place");
     }

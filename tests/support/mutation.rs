@@ -266,6 +266,7 @@ fn replacements(tree: &Value, path: &str, parts: &ImageParts) -> Vec<Value> {
             new.push(Value::Null);
             new
         }
+        Value::String(_) if field == "axis" => ["Height", "Width", "Channels"].map(|axis| json!(axis)).to_vec(),
         Value::Bool(flag) => vec![json!(!flag)],
         Value::Null => ids().chain((0..parts.tensors.len()).map(term)).collect(),
         _ if field == "residual" => {

@@ -3,8 +3,8 @@
 use firmware::image::layout::{header, region, tensor};
 use firmware::image::{Check, SectionKind, TensorRecord, layout};
 use firmware::program::{
-    Add, Attention, AveragePool, Clamp, ConstRange, Conv2d, KernelId, LayerNorm, Linear, MaxPool, Requant, Requantize,
-    Rescale, Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, Window,
+    Add, Attention, AveragePool, Clamp, ConstRange, Conv2d, CopyBox, KernelId, LayerNorm, Linear, MaxPool, Requant,
+    Requantize, Rescale, Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, Window,
 };
 use firmware::tensor::{ElementType, Shape, TensorId};
 use model_compiler::emit::{ImageParts, ImagePort, assemble, reseal};
@@ -463,6 +463,8 @@ fn of_operators() -> Vec<(Check, Vec<u8>)> {
         (Check::StepChannels, wide_norm()),
         (Check::StepTokens, long_attention()),
         (Check::StepElement, words_as_codes()),
+        (Check::StepBox, boxed([2, 1, 1], 0)),
+        (Check::StepBorder, boxed([1, 1, 1], 200)),
         (Check::Work, sealed(&work.finish(sums))),
     ]
 }
@@ -559,6 +561,16 @@ fn long_attention() -> Vec<u8> {
         clamp: FULL,
         scratch,
     }));
+    sealed(&sketch.finish(output))
+}
+
+/// One element in a border, from this place of a map of two rows.
+fn boxed(begin: [u16; 3], border: i16) -> Vec<u8> {
+    let mut sketch = Sketch::default();
+    let input = sketch.input(Shape::map(2, 2, 2));
+    let output = sketch.tensor(ElementType::I8, Shape::map(2, 2, 2));
+    let (stride, size, before) = ([1; 3], [1; 3], [1; 3]);
+    sketch.steps.push(Step::CopyBox(CopyBox { input, output, begin, stride, size, before, border }));
     sealed(&sketch.finish(output))
 }
 

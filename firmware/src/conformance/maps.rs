@@ -1,9 +1,9 @@
-//! Operators on maps: pools, sums, changes of scale, resize.
+//! Operators on maps: pools, sums, changes of scale, resize, copies.
 
 use super::draw::Draw;
 use super::{Case, Outcome, code_bits};
-use crate::kernels::{PoolArgs, ResizeArgs, TermArgs, plan};
-use crate::program::Window;
+use crate::kernels::{ConcatSourceArgs, CopyBoxArgs, PoolArgs, RequantArgs, ResizeArgs, TermArgs, plan};
+use crate::program::{Axis, Requant, Window};
 use crate::tensor::{ElementType, Shape, index};
 
 /// Channels on both sides of what kernels take at once.
@@ -140,6 +140,62 @@ pub(super) fn resize_bilinear(case: &mut Case<'_>, _: u32) -> Outcome {
     let elements = usize::try_from(output_shape.elements()).ok()?;
     case.compare(stored, elements, |kernels, output| kernels.resize_bilinear(&args, output))
 }
+
+/// A strided box inside a border.
+pub(super) fn copy_box(case: &mut Case<'_>, _: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let element = draw.element();
+    let mut axis = |longest: u16| {
+        let (begin, stride, size) = (draw.size(0, 3), draw.size(1, 3), draw.size(1, longest));
+        let (before, behind) = (draw.size(0, 2), draw.size(0, 2));
+        let input = begin + (size - 1) * stride + 1 + behind;
+        (begin, stride, size, before, input, before + size + behind)
+    };
+    let axes = [axis(6), axis(6), axis(70)];
+    let shape = |sizes: [u16; 3]| Shape::map(sizes[0], sizes[1], sizes[2]);
+    let args = CopyBoxArgs {
+        input_shape: shape(axes.map(|axis| axis.4)),
+        output_shape: shape(axes.map(|axis| axis.5)),
+        begin: axes.map(|axis| axis.0),
+        stride: axes.map(|axis| axis.1),
+        size: axes.map(|axis| axis.2),
+        before: axes.map(|axis| axis.3),
+        border: draw.half_word(*element.codes().start(), *element.codes().end()),
+    };
+    let (codes, stored) = (draw.map(element, args.input_shape)?.codes()?, draw.map(element, args.output_shape)?);
+    case.describe(format_args!("{element:?} {args:?}"));
+    let elements = usize::try_from(args.output_shape.elements()).ok()?;
+    case.compare(stored, elements, |kernels, output| kernels.copy_box(&args, codes, output))
+}
+
+/// Each axis; sources of their own scales, or of the output's.
+pub(super) fn concat(case: &mut Case<'_>, _: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let axis = draw.pick(&[Axis::Height, Axis::Width, Axis::Channels])?;
+    let (output, shape) = (draw.element(), Shape::map(draw.size(1, 5), draw.size(1, 5), draw.one_of(&CHANNELS)));
+    let (zero_point, clamp) = (draw.zero_point(output), draw.clamp(output));
+    let [first, second] = [(); 2].map(|()| {
+        let (element, size) = (draw.element(), draw.size(1, 20));
+        let shape = match axis {
+            Axis::Height => Shape { height: size, ..shape },
+            Axis::Width => Shape { width: size, ..shape },
+            Axis::Channels => Shape { channels: size, ..shape },
+        };
+        let own = draw.requant_args(element, code_bits(element), output);
+        let copied = RequantArgs { input_zero_point: zero_point, requant: ONE, ..own };
+        let requant = if element == output && draw.flag() { copied } else { own };
+        let codes = draw.map(element, shape)?.codes()?;
+        Some(ConcatSourceArgs { codes, shape, requant: RequantArgs { zero_point, clamp, ..requant } })
+    });
+    let sources = [first?, second?];
+    let elements = usize::try_from(sources.iter().map(|source| source.shape.elements()).sum::<u64>()).ok()?;
+    let stored = draw.codes(output, elements)?;
+    case.describe(format_args!("{:?} along {axis:?}, to {output:?}", sources.map(|source| source.shape)));
+    case.compare(stored, elements, |kernels, output| kernels.concat(axis, &sources, output))
+}
+
+/// A factor of exactly one.
+const ONE: Requant = Requant { multiplier: 1 << 23, shift: 23 };
 
 /// `[i0, w1]` of half-pixel centers: `src = max((d + ½)·in/out − ½, 0)` in units of `1/(2·factor)`.
 fn axis<'m>(draw: &mut Draw<'m>, size: u16, factor: u16, weight_bits: u32) -> Option<&'m [[u16; 2]]> {

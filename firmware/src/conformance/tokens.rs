@@ -1,10 +1,12 @@
 //! Operators on tokens and the waypoint decoder. Tables fall and rise like the functions that they stand for, but are
 //! straight lines: a backend must read them, not know them.
 
+use super::draw::Draw;
 use super::{Case, Difference, Outcome, first_difference};
 use crate::fixed_point::{EXP_TABLE_LEN, TANH_TABLE_LEN};
 use crate::kernels::{
-    AttentionArgs, Kernels, LayerNormArgs, Portable, TokenSourceArgs, TokensArgs, WaypointDecoderArgs, plan,
+    AttentionArgs, Kernels, LayerNormArgs, Portable, SoftmaxArgs, TokenSourceArgs, TokensArgs, WaypointDecoderArgs,
+    plan,
 };
 use crate::program::Requant;
 use crate::tensor::{Codes, CodesMut, ElementType, Shape, index};
@@ -73,10 +75,7 @@ pub(super) fn attention(case: &mut Case<'_>, number: u32) -> Outcome {
     };
     let (channels, output) = (heads * width, draw.element());
     let elements = index(tokens) * usize::from(channels);
-    let exp_table = draw.take::<i16>(EXP_TABLE_LEN)?;
-    for (entry, k) in exp_table.iter_mut().zip(0_i16..) {
-        *entry = i16::MAX - 64 * k;
-    }
+    let exp_table = exp_table(draw)?;
     let requant = draw.requant_args(ElementType::I16, 19, output);
     let args = AttentionArgs {
         tokens,
@@ -97,6 +96,33 @@ pub(super) fn attention(case: &mut Case<'_>, number: u32) -> Outcome {
     case.describe(format_args!("{tokens} tokens, {heads} heads of {width}, to {output:?}, in place: {in_place}"));
     let query = (!in_place).then_some(&*query);
     case.compare(stored, elements, |kernels, output| kernels.attention(&args, query, key, value, output, scratch))
+}
+
+/// A line from 1 to one half, Q15.
+fn exp_table<'m>(draw: &mut Draw<'m>) -> Option<&'m [i16]> {
+    let table = draw.take::<i16>(EXP_TABLE_LEN)?;
+    for (entry, k) in table.iter_mut().zip(0_i16..) {
+        *entry = i16::MAX - 64 * k;
+    }
+    Some(table)
+}
+
+/// Logits apart and in place.
+pub(super) fn softmax(case: &mut Case<'_>, number: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let channels = if number % 100 == 99 { 1 << 15 } else { u16::try_from(number % 130 + 1).ok()? };
+    let (positions, element) = (if channels < 1024 { draw.size(1, 5) } else { 1 }, draw.element());
+    let elements = usize::from(positions) * usize::from(channels);
+    let exponent = Requant { multiplier: draw.multiplier(), shift: draw.byte(8, 28) };
+    let args = SoftmaxArgs { channels, exponent, exp_table: exp_table(draw)? };
+    let codes = if draw.flag() { Some(draw.codes(element, elements)?.codes()?) } else { None };
+    let stored = draw.codes(ElementType::I16, elements)?;
+    case.describe(format_args!("{positions} rows of {channels}, {element:?}, in place: {}", codes.is_none()));
+    case.compare(stored, elements, |kernels, output| {
+        if let CodesMut::I16(output) = output {
+            kernels.softmax(&args, codes, output);
+        }
+    })
 }
 
 /// Both forms of the goal.

@@ -117,6 +117,8 @@ checks! {
     StepTokens: "more tokens than attention can sum exactly",
     StepHeads: "the heads do not divide the channels, or one is too wide",
     StepFraction: "the fraction bits of the hidden state are out of range",
+    StepBox: "the box leaves the input or the output",
+    StepBorder: "the code of the border is outside the element type",
     Work: "the program would run too long",
 }
 

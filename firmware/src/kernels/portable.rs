@@ -5,22 +5,23 @@
 
 pub mod attention;
 mod axis;
-mod codes;
+pub(super) mod codes;
+pub mod concat;
 pub mod conv2d;
+pub mod copy_box;
 pub mod elementwise;
 pub mod layer_norm;
 pub mod linear;
 #[cfg(test)]
-mod oracle;
+pub(super) mod oracle;
 pub mod pool;
 mod product;
 pub mod resize_bilinear;
+pub mod softmax;
 pub mod tokens;
 pub mod waypoint_decoder;
 mod windows;
 
 pub(crate) use axis::Axis;
-#[cfg(target_arch = "x86_64")]
-pub(crate) use codes::{Code, operand_len, take};
 #[cfg(target_arch = "x86_64")]
 pub(crate) use windows::Windows;

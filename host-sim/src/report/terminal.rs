@@ -1,23 +1,42 @@
 //! The forms for people: tables with a line per frame or step, and a short summary.
 
-use super::{FrameReport, StepReport, VerifyReport};
+use super::figures::{figure, signed};
+use super::{FrameReport, StepReport, VerifyReport, classes};
 use crate::ablation::Row;
-use crate::run::{FrameResult, RunReport, Waypoints};
+use crate::diff::{Diff, FigureChange, MENTIONED_DB, StepChange};
+use crate::gates::GateOutcome;
+use crate::run::{FrameResult, ModelInfo, Output, RunReport, Waypoints};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
 
-/// Waypoints of every frame.
+mod bench;
+
+pub use bench::bench;
+
+/// Changed steps that a terminal shows.
+const MAX_CHANGES: usize = 20;
+
+/// Waypoints or classes of every frame.
 pub fn run(report: &RunReport) -> String {
-    let longest = report.frames.iter().map(|frame| frame.waypoints.len()).max().unwrap_or(0);
+    let head = format!("{} (sha256 {}…)", report.model.name, &report.model.sha256[..16]);
+    let waypoints = |frame: &FrameResult| match &frame.output {
+        Output::Waypoints { waypoints } => Some((frame.name.clone(), waypoints.clone())),
+        Output::Class(_) => None,
+    };
+    let driven: Vec<(String, Waypoints)> = report.frames.iter().filter_map(waypoints).collect();
+    if driven.is_empty() {
+        return format!("{head}\n\n{}", classes::run(report));
+    }
+    let longest = driven.iter().map(|(_, waypoints)| waypoints.len()).max().unwrap_or(0);
     let header = ["frame".to_owned()]
         .into_iter()
         .chain((1..=longest).flat_map(|k| [format!("right {k}"), format!("forward {k}")]));
-    let row = |frame: &FrameResult| {
-        let meters = frame.waypoints.iter().flatten().map(|meters| format!("{meters:.3}"));
-        [frame.name.clone()].into_iter().chain(meters).collect()
+    let row = |(name, waypoints): &(String, Waypoints)| {
+        let meters = waypoints.iter().flatten().map(|meters| format!("{meters:.3}"));
+        [name.clone()].into_iter().chain(meters).collect()
     };
-    let table = table(header.collect(), &[0], report.frames.iter().map(row));
-    format!("{} (sha256 {}…), waypoints in meters\n\n{table}\n", report.model.name, &report.model.sha256[..16])
+    let table = table(header.collect(), &[0], driven.iter().map(row));
+    format!("{head}, waypoints in meters\n\n{table}\n")
 }
 
 /// The steps and the summary of a verification.
@@ -29,7 +48,12 @@ pub fn verify(report: &VerifyReport) -> String {
     ];
     let rows = report.steps.iter().map(step_row);
     let _ = writeln!(text, "{}\n", table(header.map(str::to_owned).to_vec(), &[1, 2, 3, 4], rows));
-    text + &summary(report)
+    text += &summary(report);
+    text += &gates(&report.gates);
+    if let Some(baseline) = &report.baseline {
+        let _ = write!(text, "\nagainst the baseline: {}", diff(baseline));
+    }
+    text
 }
 
 /// Waypoints of the engine and, below, of the f32 network; frame by frame.
@@ -50,6 +74,9 @@ pub fn waypoints(frames: &[FrameReport]) -> String {
 
 /// One line per variant of the quantizer.
 pub fn ablation(rows: &[Row]) -> String {
+    if rows.iter().any(|row| row.fidelity.classes.is_some()) {
+        return classes::ablation(rows);
+    }
     let waypoints = rows.first().map_or(0, |row| row.fidelity.mean_mm.len());
     let numbered = |what: &str| (1..=waypoints).map(|k| format!("{what} mm {k}")).collect::<Vec<_>>();
     let header = [vec!["variant".to_owned(), "vector dB".to_owned()], numbered("mean"), numbered("worst")].concat();
@@ -65,9 +92,9 @@ fn step_row(step: &StepReport) -> Vec<String> {
     vec![
         step.position.to_string(),
         step.step.clone(),
-        step.op.to_owned(),
+        step.op.clone().into_owned(),
         format!("{height}×{width}×{channels}"),
-        step.element.to_owned(),
+        step.element.clone().into_owned(),
         format!("{:.3e}", step.scale),
         figure(step.local_sqnr_db, 1),
         figure(step.sqnr_db, 1),
@@ -89,6 +116,9 @@ pub fn summary(report: &VerifyReport) -> String {
     if let (Some(step), Some(db)) = (&s.worst_step, s.worst_sqnr_db) {
         let _ = writeln!(text, "worst step             {step}: {db:.1} dB");
     }
+    if let Some(db) = s.vector_sqnr_db {
+        let _ = writeln!(text, "pooled vector          {} dB", figure(Some(db), 1));
+    }
     for (k, error) in s.waypoint_error_mm.iter().enumerate() {
         let _ = writeln!(
             text,
@@ -98,6 +128,7 @@ pub fn summary(report: &VerifyReport) -> String {
             error.max
         );
     }
+    text += &s.accuracy.as_ref().map(classes::verify).unwrap_or_default();
     let _ = writeln!(
         text,
         "arena                  {} B, lower bound {} B: {}",
@@ -109,16 +140,58 @@ pub fn summary(report: &VerifyReport) -> String {
     text
 }
 
-fn figure(value: Option<f64>, digits: usize) -> String {
-    match value {
-        None => "–".to_owned(),
-        Some(value) if value == f64::INFINITY => "exact".to_owned(),
-        Some(value) => format!("{value:.digits$}"),
+/// Steps, sizes and figures that changed.
+pub fn diff(diff: &Diff) -> String {
+    let short = |model: &ModelInfo| format!("{} ({})", model.name, model.sha256.get(..12).unwrap_or(&model.sha256));
+    let mut text = format!("from {} to {}\n", short(&diff.before), short(&diff.after));
+    if !diff.same_frames {
+        text += "the two reports are about different frames\n";
     }
+    let header = ["figure", "before", "after", "change", ""].map(str::to_owned).to_vec();
+    let digits = |unit: &str| if unit == "B" { 0 } else { 1 };
+    let row = |change: &FigureChange| {
+        let digits = digits(&change.unit);
+        let difference = change.before.zip(change.after).map(|(before, after)| after - before);
+        vec![
+            change.figure.clone(),
+            figure(change.before, digits),
+            figure(change.after, digits),
+            signed(difference, digits),
+            change.unit.clone(),
+        ]
+    };
+    let _ = writeln!(text, "\n{}\n", table(header, &[0, 4], diff.figures.iter().map(row)));
+    let changed: Vec<&StepChange> = diff.changed().collect();
+    let _ = writeln!(text, "{} of {} steps changed by {MENTIONED_DB} dB or more", changed.len(), diff.steps.len());
+    let header = ["change dB", "before", "after", "step"].map(str::to_owned).to_vec();
+    let row = |step: &&StepChange| {
+        vec![signed(step.change_db, 1), figure(step.before_db, 1), figure(step.after_db, 1), step.step.clone()]
+    };
+    if !changed.is_empty() {
+        let _ = writeln!(text, "{}", table(header, &[3], changed.iter().take(MAX_CHANGES).map(row)));
+    }
+    if changed.len() > MAX_CHANGES {
+        let _ = writeln!(text, "and {} more", changed.len() - MAX_CHANGES);
+    }
+    for (steps, which) in [(&diff.only_before, "earlier"), (&diff.only_after, "later")] {
+        if !steps.is_empty() {
+            let _ = writeln!(text, "only in the {which} report: {}", steps.join(", "));
+        }
+    }
+    text
+}
+
+/// Gates with what they met, a line each.
+pub fn gates(gates: &[GateOutcome]) -> String {
+    let line = |gate: &GateOutcome| {
+        let place = gate.place.as_ref().map(|place| format!(" ({place})")).unwrap_or_default();
+        format!("gate {} {}{place}: {}\n", gate.gate, if gate.met { "met" } else { "MISSED" }, gate.words())
+    };
+    gates.iter().map(line).collect()
 }
 
 /// A table whose columns are aligned right, except those of words.
-fn table(header: Vec<String>, words: &[usize], rows: impl Iterator<Item = Vec<String>>) -> String {
+pub(super) fn table(header: Vec<String>, words: &[usize], rows: impl Iterator<Item = Vec<String>>) -> String {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_content_arrangement(ContentArrangement::Disabled);
     table.set_header(header);
@@ -132,13 +205,15 @@ fn table(header: Vec<String>, words: &[usize], rows: impl Iterator<Item = Vec<St
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::run::ModelInfo;
 
     #[test]
     fn waypoints_stand_in_columns() {
         let model = ModelInfo { name: "mini".into(), sha256: "ab".repeat(32) };
-        let frame = |name: &str, x: f64| FrameResult { name: name.into(), waypoints: vec![[x, 2.0], [-x, 14.25]] };
-        let text = run(&RunReport { schema: 1, model, frames: vec![frame("a", 0.5), frame("long name", -10.0)] });
+        let frame = |name: &str, x: f64| {
+            let waypoints = vec![[x, 2.0], [-x, 14.25]];
+            FrameResult { name: name.into(), output: Output::Waypoints { waypoints } }
+        };
+        let text = run(&RunReport::new(model, vec![frame("a", 0.5), frame("long name", -10.0)]));
         let lines: Vec<&str> = text.lines().skip(2).collect();
         assert_eq!(
             lines[0].split_whitespace().collect::<Vec<_>>().join(" "),
@@ -175,9 +250,12 @@ mod tests {
     }
 
     #[test]
-    fn figures_that_are_missing_or_infinite_are_words() {
-        assert_eq!(figure(None, 1), "–");
-        assert_eq!(figure(Some(f64::INFINITY), 1), "exact");
-        assert_eq!(figure(Some(12.345), 2), "12.35");
+    fn a_comparison_shows_losses_first_and_strangers_last() {
+        let text = diff(&crate::diff::tests::diff());
+        let lines: Vec<&str> = text.lines().map(str::trim).collect();
+        let loss = lines.iter().position(|line| line.starts_with("−1.3") && line.ends_with("conv0"));
+        let gain = lines.iter().position(|line| line.starts_with("+1.5") && line.ends_with("conv1"));
+        assert!(loss.unwrap() < gain.unwrap(), "{text}");
+        assert!(text.contains("+512") && text.contains("only in the earlier report: conv5"), "{text}");
     }
 }

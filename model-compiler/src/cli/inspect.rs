@@ -3,8 +3,7 @@
 use crate::artifact::{self, hex};
 use crate::emit::AlignedBytes;
 use crate::error::{Error, Result};
-use crate::import::checkpoint;
-use crate::import::{NamedTensors, System};
+use crate::import::{NamedTensors, System, checkpoint, onnx};
 use crate::qmodel::QModel;
 use crate::record::Record;
 use comfy_table::{CellAlignment, Table, presets};
@@ -25,6 +24,9 @@ pub fn inspect(path: &Path) -> Result<String> {
         artifact::from_bytes(&bytes).map(|model| qmodel(&model))
     } else if artifact::is::<Record>(&bytes) {
         artifact::from_bytes(&bytes).map(|record| build_record(&record))
+    } else if onnx::is_onnx(&bytes) {
+        let digest = hex(&artifact::sha256(&bytes));
+        onnx::Model::parse(bytes).map(|model| network(&model, &digest))
     } else {
         checkpoint::parse(&bytes).map(|checkpoint| tensors(&checkpoint))
     };
@@ -68,7 +70,7 @@ fn image(bytes: &[u8]) -> Result<String> {
         let length = image.section(kind).len().to_string();
         sections.add_row([kind.name().to_owned(), length, format!("{:08x}", image.section_crc(kind))]);
     }
-    let _ = writeln!(text, "{sections}\n");
+    let _ = writeln!(text, "{}\n", sections.trim_fmt());
 
     let mut ports = table(&["port", "name", "type", "shape", "scale", "zero point"], 4);
     let inputs = (0..image.input_count()).filter_map(|i| Some(("input", image.input(i)?)));
@@ -79,7 +81,7 @@ fn image(bytes: &[u8]) -> Result<String> {
         let (scale, zero_point) = (port.scale.to_string(), port.zero_point.to_string());
         ports.add_row([direction, port.name, element_name(record.element), &shape, &scale, &zero_point]);
     }
-    let _ = writeln!(text, "{ports}\n");
+    let _ = writeln!(text, "{}\n", ports.trim_fmt());
 
     let records: Vec<_> =
         (0..image.tensor_count()).filter_map(|i| image.tensor(firmware::tensor::TensorId(i))).collect();
@@ -100,7 +102,7 @@ fn image(bytes: &[u8]) -> Result<String> {
             live.to_string(),
         ]);
     }
-    let _ = writeln!(text, "{steps}");
+    let _ = writeln!(text, "{}", steps.trim_fmt());
     let bound = (0..image.step_count()).map(|p| live_bytes(&records, p)).max().unwrap_or(0);
     let _ = writeln!(text, "\narena {} B, largest live sum {bound} B", image.arena_bytes());
     Ok(text)
@@ -140,7 +142,7 @@ fn qmodel(model: &QModel) -> String {
             step.op.weight_bytes().to_string(),
         ]);
     }
-    let _ = writeln!(text, "{steps}");
+    let _ = writeln!(text, "{}", steps.trim_fmt());
     text
 }
 
@@ -151,6 +153,33 @@ fn build_record(record: &Record) -> String {
     let (arena, bound) = (record.plan.arena_bytes, record.plan.bound_bytes);
     let _ = writeln!(text, "arena            {arena} B, bound {bound} B: {}\n", record.plan.status.words());
     text + &qmodel(&record.model)
+}
+
+fn network(model: &onnx::Model, digest: &str) -> String {
+    let mut text = String::new();
+    let (constants, values) = model.parameters();
+    let operators = model.operators();
+    let _ = writeln!(text, "ONNX model  opset {}", model.opset());
+    if !model.producer().is_empty() {
+        let _ = writeln!(text, "producer    {}", model.producer());
+    }
+    let _ = writeln!(text, "sha256      {digest}");
+    let _ = writeln!(text, "parameters  {constants} tensors, {values} values");
+    let _ = writeln!(text, "nodes       {}\n", operators.values().sum::<usize>());
+    let mut ports = table(&["port", "name", "type"], 3);
+    for (name, kind) in model.inputs() {
+        ports.add_row(["input", name, &kind]);
+    }
+    for (name, kind) in model.outputs() {
+        ports.add_row(["output", name, &kind]);
+    }
+    let _ = writeln!(text, "{ports}\n");
+    let mut nodes = table(&["operator", "nodes"], 1);
+    for (operator, count) in operators {
+        nodes.add_row([operator, count.to_string()]);
+    }
+    let _ = writeln!(text, "{nodes}");
+    text
 }
 
 fn tensors(checkpoint: &checkpoint::Checkpoint) -> String {
@@ -167,7 +196,7 @@ fn tensors(checkpoint: &checkpoint::Checkpoint) -> String {
         let count = tensor.shape.iter().product::<usize>().to_string();
         rows.add_row([tensor.name.clone(), format!("{:?}", tensor.dtype), format!("{:?}", tensor.shape), count]);
     }
-    let _ = writeln!(text, "{rows}");
+    let _ = writeln!(text, "{}", rows.trim_fmt());
     if !checkpoint.skipped().is_empty() {
         let _ = writeln!(text, "\nnot tensors, skipped: {}", checkpoint.skipped().join(", "));
     }

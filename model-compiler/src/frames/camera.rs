@@ -3,6 +3,7 @@
 use super::ByteMap;
 use crate::error::{Error, ErrorCode, Result};
 use firmware::tensor::Shape;
+use image::RgbImage;
 use std::path::Path;
 
 /// Reads an image file and cuts out its center at the network's size. An image of exactly that size is taken whole.
@@ -10,16 +11,21 @@ use std::path::Path;
 /// # Errors
 /// The file is missing or no readable image, or the image is smaller than the network's input.
 pub fn load(path: &Path, shape: Shape) -> Result<ByteMap> {
+    let image = decode(path)?;
+    let (width, height) = image.dimensions();
+    let full = FullImage { height: height as usize, width: width as usize, rgb: image.as_raw() };
+    center_crop(&full, shape).map_err(|e| e.within(path.display()))
+}
+
+/// The pixels of an image file, told from its first bytes.
+pub(super) fn decode(path: &Path) -> Result<RgbImage> {
     let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format);
     let decoded = reader.map_err(|e| Error::io(path, &e))?.decode();
     let refuse = |e: image::ImageError| {
         Error::new(ErrorCode::Frames, path.display().to_string(), format!("no readable image: {e}"))
             .with_help("expected a whole PNG or JPEG file; copy or save it again")
     };
-    let image = decoded.map_err(refuse)?.into_rgb8();
-    let (width, height) = image.dimensions();
-    let full = FullImage { height: height as usize, width: width as usize, rgb: image.as_raw() };
-    center_crop(&full, shape).map_err(|e| e.within(path.display()))
+    Ok(decoded.map_err(refuse)?.into_rgb8())
 }
 
 struct FullImage<'a> {

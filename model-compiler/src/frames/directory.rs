@@ -56,6 +56,7 @@ fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
         goal: format.goal.then(|| description.goal()).transpose()?,
         command: description.command()?,
         dropped_points,
+        label: None,
     })
 }
 

@@ -1,10 +1,14 @@
 //! Ready network inputs in a `.safetensors` file: `rgb` u8 `[N,3,H,W]`, `bev` u8 `[N,2,H,W]` (counts 0..=5), `velocity`
 //! f32 `[N]`, `target` f32 `[N,2]` (network frame), and optionally `command` i32 `[N]`.
+//!
+//! Of a classifier: the image by the network's own name for it, or as `rgb`, `[N,C,H,W]`, and optionally `label` i64
+//! `[N]`. Images may be f32 as well; they are raw, so every value is a whole number 0..=255.
 
-use super::{ByteMap, Frame, FrameFormat, bev};
+use super::{ByteMap, Frame, FrameFormat, Label, bev};
 use crate::error::{Error, ErrorCode, Result};
 use firmware::tensor::Shape;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
+use std::borrow::Cow;
 use std::path::Path;
 
 /// Loads the tensors that the network needs; others may be missing or of any shape.
@@ -20,7 +24,7 @@ pub(super) fn load(path: &Path, format: &FrameFormat) -> Result<Vec<Frame>> {
 
 fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Vec<Frame>> {
     let mut batch = Batch { file, frames: None };
-    let rgb = format.image.map(|shape| batch.maps("rgb", shape)).transpose()?;
+    let rgb = format.image.map(|shape| batch.maps(batch.image_name(format), shape)).transpose()?;
     let bev = format.bev.map(|shape| batch.maps("bev", shape)).transpose()?;
     if let Some(count) = bev.iter().flatten().flat_map(|map| &map.data).find(|&&count| count > bev::MAX_COUNT) {
         return Err(tensor_error("bev", format!("holds {count}, expected counts 0..=5")));
@@ -29,6 +33,7 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
     let goal = format.goal.then(|| batch.floats("target", &[2])).transpose()?;
     let count = batch.frames.unwrap_or(0);
     let command = batch.commands(count)?;
+    let labels = format.classes.map(|classes| batch.labels(classes)).transpose()?.flatten();
     if count == 0 {
         return Err(Error::new(ErrorCode::Frames, "", "holds no frame that this network could read"));
     }
@@ -40,6 +45,7 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
         goal: goal.as_ref().map(|g| [f64::from(g[2 * i]), f64::from(g[2 * i + 1])]),
         command: command.as_ref().map(|c| c[i]),
         dropped_points: 0,
+        label: labels.as_ref().map(|labels| labels[i].clone()),
     };
     Ok((0..count).map(frame).collect())
 }
@@ -50,8 +56,14 @@ struct Batch<'a> {
     frames: Option<usize>,
 }
 
-impl Batch<'_> {
-    fn tensor(&mut self, name: &str, element: Dtype, per_frame: &[usize]) -> Result<TensorView<'_>> {
+impl<'a> Batch<'a> {
+    /// The network's own name for its image, unless the file has only `rgb`.
+    fn image_name<'n>(&self, format: &'n FrameFormat) -> &'n str {
+        let has = |name: &str| self.file.tensor(name).is_ok();
+        if has("rgb") && !has(&format.image_name) { "rgb" } else { &format.image_name }
+    }
+
+    fn tensor(&mut self, name: &str, element: Dtype, per_frame: &[usize]) -> Result<TensorView<'a>> {
         let Ok(view) = self.file.tensor(name) else {
             let error = tensor_error(name, "missing; this network needs it");
             return Err(error.with_help(format!("the file holds: {}", self.held())));
@@ -90,13 +102,34 @@ impl Batch<'_> {
     /// `[N][C][H][W]` to a channel-fastest map per frame.
     fn maps(&mut self, name: &str, shape: Shape) -> Result<Vec<ByteMap>> {
         let [height, width, channels] = [shape.height, shape.width, shape.channels].map(usize::from);
-        let view = self.tensor(name, Dtype::U8, &[channels, height, width])?;
+        let per_frame = [channels, height, width];
+        let is_float = self.file.tensor(name).is_ok_and(|view| view.dtype() == Dtype::F32);
+        let planes = match is_float {
+            true => grey_levels(name, &self.floats(name, &per_frame)?)?.into(),
+            false => Cow::Borrowed(self.tensor(name, Dtype::U8, &per_frame)?.data()),
+        };
         let plane = height * width;
         let channel_fastest = |planes: &[u8]| {
             let data = (0..plane).flat_map(|p| (0..channels).map(move |c| planes[c * plane + p])).collect();
             ByteMap { shape, data }
         };
-        Ok(view.data().chunks_exact(channels * plane).map(channel_fastest).collect())
+        Ok(planes.chunks_exact(channels * plane).map(channel_fastest).collect())
+    }
+
+    fn labels(&mut self, classes: u16) -> Result<Option<Vec<Label>>> {
+        if self.file.tensor("label").is_err() {
+            return Ok(None);
+        }
+        let view = self.tensor("label", Dtype::I64, &[])?;
+        let label = |(i, &bytes): (usize, &[u8; 8])| {
+            let value = i64::from_le_bytes(bytes);
+            let class = u16::try_from(value).ok().filter(|&class| class < classes).ok_or_else(|| {
+                let last = classes.saturating_sub(1);
+                tensor_error("label", format!("holds {value} for frame {i}, the network has classes 0..={last}"))
+            })?;
+            Ok(Label { class, name: String::new() })
+        };
+        view.data().as_chunks::<8>().0.iter().enumerate().map(label).collect::<Result<_>>().map(Some)
     }
 
     fn floats(&mut self, name: &str, per_frame: &[usize]) -> Result<Vec<f32>> {
@@ -118,6 +151,17 @@ impl Batch<'_> {
         let values = view.data().chunks_exact(4).map(|b| i32::from_le_bytes([b[0], b[1], b[2], b[3]]));
         Ok(values.map(|v| u8::try_from(v).ok().filter(|c| (1..=6).contains(c))).collect())
     }
+}
+
+fn grey_levels(name: &str, values: &[f32]) -> Result<Vec<u8>> {
+    let level = |&value: &f32| {
+        let is_level = value.fract() == 0.0 && (0.0..=255.0).contains(&value);
+        is_level.then_some(value as u8).ok_or_else(|| {
+            tensor_error(name, format!("holds {value}, expected whole numbers 0..=255"))
+                .with_help("give raw pixels; mean, deviation and scale are part of the network")
+        })
+    };
+    values.iter().map(level).collect()
 }
 
 fn tensor_error(name: &str, message: impl Into<String>) -> Error {
@@ -153,12 +197,16 @@ mod tests {
     }
 
     fn load_tensors(tensors: &[Tensor]) -> Result<Vec<Frame>> {
+        load_as(&format(), tensors)
+    }
+
+    fn load_as(format: &FrameFormat, tensors: &[Tensor]) -> Result<Vec<Frame>> {
         let views = tensors.iter().map(|t| (t.0, TensorView::new(t.1, t.2.clone(), &t.3).unwrap()));
         let bytes = safetensors::serialize(views, None).unwrap();
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("inputs.safetensors");
         std::fs::write(&path, bytes).unwrap();
-        load(&path, &format())
+        load(&path, format)
     }
 
     #[test]
@@ -186,6 +234,29 @@ mod tests {
             let mut tensors = good();
             damage(&mut tensors);
             let message = load_tensors(&tensors).unwrap_err().to_string();
+            assert!(message.contains(expected), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_classifier_reads_its_own_name_or_rgb_and_labels() {
+        let format = FrameFormat::new("classifier", [(InputKind::Image, Shape::map(1, 2, 1))])
+            .with_output("data", Some(Shape::vector(10)));
+        let labels = |values: [i64; 2]| Tensor("label", Dtype::I64, vec![2], values.map(i64::to_le_bytes).concat());
+        let floats = |values: [f32; 4]| values.map(f32::to_le_bytes).concat();
+        let image = |name, values| Tensor(name, Dtype::F32, vec![2, 1, 1, 2], floats(values));
+        let frames = load_as(&format, &[image("data", [0.0, 255.0, 7.0, 8.0]), labels([9, 0])]).unwrap();
+        assert_eq!(frames[1].rgb.as_ref().unwrap().data, [7, 8]);
+        assert_eq!(frames[0].label, Some(Label { class: 9, name: String::new() }));
+        let frames = load_as(&format, &[Tensor("rgb", Dtype::U8, vec![2, 1, 1, 2], vec![1, 2, 3, 4])]).unwrap();
+        assert_eq!((frames[1].rgb.as_ref().unwrap().data.as_slice(), &frames[1].label), (&[3, 4][..], &None));
+        for (tensors, expected) in [
+            (vec![image("data", [0.5, 0.0, 0.0, 0.0])], "tensor `data`: holds 0.5, expected whole numbers 0..=255"),
+            (vec![image("data", [0.0, 0.0, 256.0, 0.0])], "tensor `data`: holds 256, expected whole numbers 0..=255"),
+            (vec![image("data", [1.0; 4]), labels([0, -1])], "holds -1 for frame 1, the network has classes 0..=9"),
+            (vec![image("other", [1.0; 4])], "tensor `data`: missing"),
+        ] {
+            let message = load_as(&format, &tensors).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");
         }
     }

@@ -24,6 +24,7 @@ use sha2::{Digest, Sha256};
 
 use crate::error::{Error, ErrorCode, Result};
 
+pub(super) use element::decode;
 pub use element::{DType, TensorData};
 
 /// Largest file that is opened, in bytes: far above any driving network, far below a host's memory.
@@ -170,7 +171,7 @@ pub fn read(path: &Path) -> Result<Checkpoint> {
     parse(&bytes).map_err(|error| error.within(path.display()))
 }
 
-fn read_bounded(path: &Path) -> Result<Vec<u8>> {
+pub(super) fn read_bounded(path: &Path) -> Result<Vec<u8>> {
     let metadata = std::fs::metadata(path).map_err(|error| Error::io(path, &error))?;
     if metadata.len() > MAX_FILE_BYTES {
         let message = format!("found {} bytes, expected at most {MAX_FILE_BYTES}", metadata.len());
@@ -208,7 +209,7 @@ fn recognize(bytes: &[u8]) -> Result<Format> {
             None | Some([]) => "an empty file".to_owned(),
             Some(start) => format!("a file that begins with \"{}\"", start.escape_ascii()),
         };
-        let expected = "expected a torch zip archive (PK), a torch legacy stream (a pickle) or safetensors";
+        let expected = "expected a torch zip archive (PK), a torch legacy stream (a pickle), safetensors or ONNX";
         let help = if bytes.starts_with(b"version https://git-lfs") {
             "this is a pointer left by Git LFS: fetch the file itself with `git lfs pull`"
         } else {
@@ -234,7 +235,7 @@ fn quoted(text: &str) -> String {
 }
 
 /// A damaged file; the usual cause is an incomplete copy.
-fn malformed(place: impl Into<String>, message: impl Into<String>) -> Error {
+pub(super) fn malformed(place: impl Into<String>, message: impl Into<String>) -> Error {
     Error::new(ErrorCode::Malformed, place, message)
         .with_help("the file is damaged or incomplete: copy or download it again")
 }

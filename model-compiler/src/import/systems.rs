@@ -18,6 +18,8 @@ mod transformer;
 mod transfuser;
 mod weights;
 
+pub(super) use weights::oihw_to_ohwi;
+
 /// Height and width of camera crop and LiDAR histogram as published, pixels.
 const DEFAULT_RESOLUTION: (u16, u16) = (256, 256);
 

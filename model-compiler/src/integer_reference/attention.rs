@@ -1,14 +1,11 @@
 //! Multi-head attention: base-2 softmax from a table, one division per row.
 
-use super::arithmetic::{Exactness, Requantizer, RoundingShift, bits, power_of_two, quotient, to_f64};
-use super::operands::{Operands, expect, positions};
+use super::arithmetic::{Exactness, Requantizer, RoundingShift, bits, power_of_two, quotient};
+use super::operands::{Operands, positions};
+use super::softmax::Exponential;
 use crate::error::{Error, ErrorCode, Result};
 use crate::qmodel::QTensorId;
-use firmware::program::Requant;
 use rayon::prelude::*;
-
-/// Exponents from here on count as 31 whole powers of two: their weight is 0.
-const LARGEST_EXPONENT: f64 = 31.0 * 65536.0;
 
 /// The tensors of the step, all `T×C`.
 pub(super) struct Tensors {
@@ -16,14 +13,6 @@ pub(super) struct Tensors {
     pub(super) key: QTensorId,
     pub(super) value: QTensorId,
     pub(super) output: QTensorId,
-}
-
-/// From logits to weights.
-pub(super) struct Softmax {
-    multiplier: f64,
-    shift: RoundingShift,
-    /// `T[k]` and `T[k] − T[k+1]`.
-    table: Vec<(f64, f64)>,
 }
 
 /// From the weighted mean (Q12) to output codes.
@@ -37,7 +26,7 @@ pub(super) fn attention<'a>(
     operands: &Operands<'_, 'a>,
     tensors: &Tensors,
     heads: usize,
-    softmax: &Softmax,
+    exponential: &Exponential,
     context: &Context,
 ) -> Result<Vec<f64>> {
     let shape = operands.shape(tensors.output)?;
@@ -56,7 +45,7 @@ pub(super) fn attention<'a>(
         for head in 0..heads {
             let of_head = head * size..(head + 1) * size;
             let rows = |matrix: &'a [f64]| matrix.chunks_exact(channels).map(|row| &row[of_head.clone()]);
-            let weights = softmax.weights(&query[of_head.clone()], rows(key), &mut exact);
+            let weights = weights(exponential, &query[of_head.clone()], rows(key), &mut exact);
             context.combine(&weights, rows(value), &mut output[of_head.clone()], &mut exact);
         }
         exact.finish()
@@ -64,35 +53,16 @@ pub(super) fn attention<'a>(
     Ok(result)
 }
 
-impl Softmax {
-    pub(super) fn new(exponent: Requant, table: &[i16]) -> Result<Self> {
-        expect("entries of the exponential table", table.len(), 257)?;
-        let table = to_f64(table);
-        Ok(Self {
-            multiplier: f64::from(exponent.multiplier),
-            shift: RoundingShift::new(u32::from(exponent.shift)),
-            table: table.windows(2).map(|pair| (pair[0], pair[0] - pair[1])).collect(),
-        })
-    }
-
-    /// `e_j` (Q15) of every key for one query.
-    fn weights<'k>(&self, query: &[f64], keys: impl Iterator<Item = &'k [f64]>, exact: &mut Exactness) -> Vec<f64> {
-        let dot = |key: &[f64]| query.iter().zip(key).map(|(q, k)| q * k).sum::<f64>();
-        let logits: Vec<f64> = keys.map(|key| exact.watch(dot(key))).collect();
-        let largest = logits.iter().copied().fold(f64::NEG_INFINITY, f64::max);
-        logits.iter().map(|logit| self.weight(largest - logit, exact)).collect()
-    }
-
-    /// `e = 2^-u` (Q15) of a distance from the largest logit.
-    fn weight(&self, distance: f64, exact: &mut Exactness) -> f64 {
-        let u = self.shift.round(distance * self.multiplier, exact).min(LARGEST_EXPONENT);
-        let whole = (u * power_of_two(-16)).floor();
-        let fraction = u - whole * power_of_two(16);
-        let entry = (fraction * power_of_two(-8)).floor();
-        let rest = fraction - entry * power_of_two(8);
-        let (value, drop) = self.table[entry as usize];
-        RoundingShift::new(8 + (whole as u32).min(23)).round(value * 256.0 - drop * rest, exact)
-    }
+/// `e_j` (Q15) of every key for one query.
+fn weights<'k>(
+    exponential: &Exponential,
+    query: &[f64],
+    keys: impl Iterator<Item = &'k [f64]>,
+    exact: &mut Exactness,
+) -> Vec<f64> {
+    let dot = |key: &[f64]| query.iter().zip(key).map(|(q, k)| q * k).sum::<f64>();
+    let logits: Vec<f64> = keys.map(|key| exact.watch(dot(key))).collect();
+    exponential.of_logits(&logits, exact)
 }
 
 impl Context {
@@ -123,51 +93,14 @@ impl Context {
 
 #[cfg(test)]
 mod tests {
-    use super::{Exactness, Softmax};
     use crate::error::ErrorCode;
     use crate::integer_reference::testing::{Random, clamp, execute_alone, requant, round};
     use crate::qmodel::{QOp, QTensorId};
-    use firmware::program::Requant;
     use firmware::tensor::{ElementType, Shape};
 
     /// `T[k] = min(32767, round(2^15·2^(−k/256)))`.
     fn exp_table() -> Vec<i16> {
         (0..=256).map(|k| round(32768.0 * (-f64::from(k) / 256.0).exp2()).min(32767.0) as i16).collect()
-    }
-
-    /// Distances are already in Q16: u = δ.
-    fn unit_softmax() -> Softmax {
-        Softmax::new(Requant { multiplier: 1 << 23, shift: 23 }, &exp_table()).unwrap()
-    }
-
-    #[test]
-    fn weights_at_known_distances() {
-        let softmax = unit_softmax();
-        let mut exact = Exactness::default();
-        let mut weight = |u: f64| softmax.weight(u, &mut exact);
-        assert_eq!(weight(0.0), 32767.0);
-        // 32767/2 is a tie; 2^(−1/256) is an entry of its own, and half way to it lies the mean of both entries.
-        assert_eq!(weight(65536.0), 16384.0);
-        assert_eq!(weight(256.0), f64::from(exp_table()[1]));
-        assert_eq!(weight(128.0), ((32767.0 + f64::from(exp_table()[1])) / 2.0 + 0.5).floor());
-        assert_eq!(weight(15.0 * 65536.0), 1.0);
-        assert_eq!(weight(17.0 * 65536.0), 0.0);
-        assert_eq!(weight(31.0 * 65536.0), 0.0);
-        assert_eq!(weight(1e9), 0.0);
-    }
-
-    #[test]
-    fn weights_fall_and_follow_the_power_of_two() {
-        let softmax = unit_softmax();
-        let mut exact = Exactness::default();
-        let mut last = f64::INFINITY;
-        for u in (0..18 * 65536).step_by(7) {
-            let weight = softmax.weight(f64::from(u), &mut exact);
-            let expected = 32768.0 * (-f64::from(u) / 65536.0).exp2();
-            assert!(weight <= last, "u = {u}");
-            assert!((weight - expected).abs() < 1.51, "u = {u}: {weight} for {expected}");
-            last = weight;
-        }
     }
 
     struct Case {
@@ -240,27 +173,6 @@ mod tests {
                 let error = (found / case.gain - mean).abs();
                 assert!(error < 0.03, "{} for {mean} at {row},{channel}, seed {seed:#x}", found / case.gain);
             }
-        }
-    }
-
-    #[test]
-    fn a_row_of_weights_sums_to_one() {
-        let seed = 0xa78;
-        let mut random = Random(seed);
-        let softmax = Softmax::new(requant(1e-3 * std::f64::consts::LOG2_E * 65536.0), &exp_table()).unwrap();
-        for count in [1, 2, 17, 128, 512] {
-            let query = random.codes(32, -127, 127);
-            let keys: Vec<Vec<f64>> = (0..count).map(|_| random.codes(32, -127, 127)).collect();
-            let mut exact = Exactness::default();
-            let weights = softmax.weights(&query, keys.iter().map(Vec::as_slice), &mut exact);
-            let sum: f64 = weights.iter().sum();
-            let reciprocal = ((f64::from(super::bits(sum)) + 22.0).exp2() / sum).floor();
-            // Probabilities in Q15, as a stand-alone softmax would give them.
-            let unit = (f64::from(super::bits(sum)) + 7.0).exp2();
-            let total: f64 = weights.iter().map(|e| (e * reciprocal / unit + 0.5).floor()).sum();
-            assert!((total - 32768.0).abs() <= 1.0 + 0.5 * f64::from(count), "{total} of {count} keys, seed {seed:#x}");
-            assert_eq!(weights.iter().copied().fold(0.0, f64::max), 32767.0);
-            exact.finish().unwrap();
         }
     }
 

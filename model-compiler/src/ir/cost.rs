@@ -70,13 +70,17 @@ impl Op {
                 vector("output bias", &d.output_bias),
             ],
             Self::Input(_)
-            | Self::Relu
+            | Self::Clip(_)
             | Self::Add { .. }
             | Self::MaxPool(_)
             | Self::AveragePool(_)
             | Self::GlobalPool
             | Self::ResizeBilinear { .. }
-            | Self::Attention { .. } => Vec::new(),
+            | Self::Attention { .. }
+            | Self::Slice(_)
+            | Self::Pad(_)
+            | Self::Concat(_)
+            | Self::Softmax => Vec::new(),
         }
     }
 }
@@ -119,7 +123,7 @@ impl Graph {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ir::{InputKind, LayerNorm, Linear, Shape};
+    use crate::ir::{Clip, InputKind, LayerNorm, Linear, Shape};
     use std::sync::Arc;
 
     #[test]
@@ -141,7 +145,7 @@ mod tests {
         let mut graph = Graph::default();
         let x = graph.push_input("x", InputKind::Velocity, Shape::tokens(6, 4));
         let weights = Arc::new(Weights { shape: vec![8, 4], data: vec![0.0; 32] });
-        let linear = Linear { weights, bias: Some(Arc::new(vec![0.0; 8])), relu: false };
+        let linear = Linear { weights, bias: Some(Arc::new(vec![0.0; 8])), clip: Clip::NONE };
         let y = graph.push("y", Op::Linear(linear), &[x]).unwrap();
         graph.push("z", Op::Attention { heads: 2 }, &[y, y, y]).unwrap();
         assert_eq!(graph.node_macs(&graph.nodes[1]), 6 * 8 * 4);

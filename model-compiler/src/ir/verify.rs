@@ -1,6 +1,6 @@
 //! Shape rules and the checklist of graph invariants.
 
-use super::{Graph, Node, Op, Shape, ValueId};
+use super::{Clip, Conv2d, Graph, Linear, Node, Op, Shape, ValueId};
 use std::collections::HashSet;
 
 /// Checks every invariant of the [module page](super) and of the names, and collects all violations.
@@ -92,6 +92,20 @@ impl Checklist<'_> {
                 self.error(node, format!("{what}: {} at index {i}", data[i]));
             }
         }
+        let clip = match &node.op {
+            Op::Conv2d(Conv2d { clip, .. }) | Op::Linear(Linear { clip, .. }) | Op::Clip(clip) | Op::Add { clip } => {
+                *clip
+            }
+            _ => Clip::NONE,
+        };
+        if clip.min > clip.max || clip.min.is_nan() || clip.max.is_nan() {
+            self.error(node, format!("bounds {} and {} are in the wrong order", clip.min, clip.max));
+        }
+        if let Op::Pad(pad) = &node.op
+            && !pad.value.is_finite()
+        {
+            self.error(node, format!("border value {}", pad.value));
+        }
         let (what, divisors) = match &node.op {
             Op::BatchNorm(bn) => ("variance + ε", bn.variance.iter().map(|v| v + bn.epsilon).collect()),
             Op::Normalize(n) => ("standard deviation", n.std.clone()),
@@ -141,6 +155,14 @@ fn narrow(what: &str, value: usize) -> Result<u16, String> {
     u16::try_from(value).map_err(|_| format!("{what}: {value} exceeds 65535"))
 }
 
+/// Names of the axes of a map, in order.
+const AXES: [&str; 3] = ["height", "width", "channels"];
+
+/// The shape whose axes follow one by one.
+fn map_axes(shape: Shape, size: impl Fn(usize, u16) -> Result<u16, String>) -> Result<Shape, String> {
+    Ok(Shape::map(size(0, shape.height)?, size(1, shape.width)?, size(2, shape.channels)?))
+}
+
 /// See [`Op::output_shape`].
 pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
     let channels = |s: Shape| usize::from(s.channels);
@@ -184,7 +206,7 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
             }
             Ok(inputs[0])
         }
-        Op::Relu => {
+        Op::Clip(_) | Op::Softmax => {
             arity(op, inputs, 1..=1)?;
             Ok(inputs[0])
         }
@@ -295,25 +317,56 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
             expect("goal values", inputs[1].elements() as usize, 2)?;
             Ok(Shape::tokens(d.steps, 2))
         }
+        Op::Slice(slice) => {
+            arity(op, inputs, 1..=1)?;
+            map_axes(inputs[0], |axis, size| {
+                let (begin, end, stride) = (slice.begin[axis], slice.end[axis], slice.stride[axis]);
+                if stride == 0 || begin >= end || end > size {
+                    return Err(format!("slice {begin}..{end} of stride {stride} does not fit {size} {}", AXES[axis]));
+                }
+                Ok((end - begin).div_ceil(stride))
+            })
+        }
+        Op::Pad(pad) => {
+            arity(op, inputs, 1..=1)?;
+            map_axes(inputs[0], |axis, size| {
+                let sum = usize::from(pad.before[axis]) + usize::from(size) + usize::from(pad.after[axis]);
+                narrow(AXES[axis], sum)
+            })
+        }
+        Op::Concat(axis) => {
+            arity(op, inputs, 1..=usize::MAX)?;
+            let joined = *axis as usize;
+            map_axes(inputs[0], |axis, size| {
+                let sizes = inputs.iter().map(|s| [s.height, s.width, s.channels][axis]);
+                if axis == joined {
+                    return narrow(AXES[axis], sizes.map(usize::from).sum());
+                }
+                match sizes.into_iter().find(|&other| other != size) {
+                    Some(other) => Err(format!("{} of the operands: found {other}, expected {size}", AXES[axis])),
+                    None => Ok(size),
+                }
+            })
+        }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ir::{InputKind, Linear, Weights};
+    use crate::ir::{InputKind, Weights};
     use std::sync::Arc;
 
     fn linear(outputs: usize, inputs: usize, value: f32) -> Op {
         let weights = Arc::new(Weights { shape: vec![outputs, inputs], data: vec![value; outputs * inputs] });
-        Op::Linear(Linear { weights, bias: None, relu: false })
+        Op::Linear(Linear { weights, bias: None, clip: Clip::NONE })
     }
 
     fn small() -> Graph {
         let mut graph = Graph::default();
         let x = graph.push_input("x", InputKind::Goal, Shape::vector(2));
         let a = graph.push("a", linear(3, 2, 1.0), &[x]).unwrap();
-        let b = graph.push("b", Op::Relu, &[a]).unwrap();
+        let b = graph.push("b", Op::Clip(Clip::RELU), &[a]).unwrap();
         graph.outputs.push(b);
         graph
     }

@@ -6,8 +6,8 @@ use firmware::kernels::plan::max_pool_in_place;
 /// Operands whose memory the output may take over, if nothing else needs them; a max pool's only if `pooling`, the
 /// others only if `sums`.
 ///
-/// The kernels read such an operand element by element (attention: row by row; max pool: where the rule of the kernels
-/// holds) before they write there. An operand that the step reads twice is excluded.
+/// The kernels read such an operand element by element (attention, softmax: row by row; max pool: where the rule of
+/// the kernels holds) before they write there. An operand that the step reads twice is excluded.
 pub(super) fn overwritable(model: &QModel, op: &QOp, pooling: bool, sums: bool) -> Vec<QTensorId> {
     let output = model.tensor(op.output());
     let residual = |rescale: &QRescale| match rescale.residual {
@@ -25,6 +25,7 @@ pub(super) fn overwritable(model: &QModel, op: &QOp, pooling: bool, sums: bool) 
         QOp::Add { first, second, .. } if sums => vec![first.tensor, second.tensor],
         QOp::ResizeBilinear { residual: Some(residual), .. } if sums => vec![residual.tensor],
         QOp::Attention { query, .. } if sums => vec![*query],
+        QOp::Softmax { input, .. } if sums => vec![*input],
         _ => vec![],
     };
     let reads = op.reads();

@@ -38,6 +38,7 @@ fn renumber(graph: &mut Graph, live: &[bool]) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::ir::Clip;
     use crate::ir::verify::verify;
     use crate::ir::{InputKind, Shape};
     use crate::passes::fixture::{conv, image};
@@ -46,7 +47,7 @@ mod tests {
     fn unread_chain_goes_and_unread_input_stays() {
         let (mut graph, rgb) = image();
         let dead = conv(&mut graph, "dead", rgb, 4);
-        graph.push("dead.relu", Op::Relu, &[dead]).unwrap();
+        graph.push("dead.relu", Op::Clip(Clip::RELU), &[dead]).unwrap();
         graph.push_input("velocity", InputKind::Velocity, Shape::vector(1));
         let kept = conv(&mut graph, "kept", rgb, 4);
         graph.outputs.push(kept);

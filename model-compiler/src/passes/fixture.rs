@@ -1,6 +1,6 @@
 //! Parts of small graphs for the passes' tests.
 
-use crate::ir::{BatchNorm, Conv2d, Graph, InputKind, Op, Shape, ValueId, Weights};
+use crate::ir::{BatchNorm, Clip, Conv2d, Graph, InputKind, Op, Shape, ValueId, Weights};
 use firmware::program::Window;
 use std::sync::Arc;
 
@@ -17,7 +17,7 @@ pub(super) fn conv(graph: &mut Graph, name: &str, input: ValueId, outputs: usize
     let data = (1..=outputs * channels).map(|v| v as f32).collect();
     let weights = Arc::new(Weights { shape: vec![outputs, 1, 1, channels], data });
     let window = Window::square(1, 1, 0);
-    let op = Conv2d { weights, bias: None, window, groups: 1, normalization: None, relu: false };
+    let op = Conv2d { weights, bias: None, window, groups: 1, normalization: None, clip: Clip::NONE };
     graph.push(name, Op::Conv2d(op), &[input]).unwrap()
 }
 

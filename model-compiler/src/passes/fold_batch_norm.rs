@@ -1,37 +1,50 @@
-//! Batch norm into the weights and bias of the convolution before it.
+//! Batch norm into the weights and bias of the convolution or linear layer before it.
 
 use super::rewrite::merge_into_reader;
-use crate::ir::{BatchNorm, Conv2d, Graph, Op, Weights};
+use crate::ir::{BatchNorm, Clip, Conv2d, Graph, Linear, Op, Weights};
 use std::sync::Arc;
 
 pub(super) fn run(graph: &mut Graph) {
-    merge_into_reader(graph, |producer, reader, _| match (&producer.op, &reader.op) {
-        (Op::Conv2d(conv), Op::BatchNorm(norm)) if !conv.relu && producer.inputs.len() == 1 => {
-            Some((Op::Conv2d(fold(conv, norm)), producer.inputs.clone()))
+    merge_into_reader(graph, |producer, reader, _| {
+        let Op::BatchNorm(norm) = &reader.op else { return None };
+        if producer.inputs.len() != 1 {
+            return None;
         }
-        _ => None,
+        let op = match &producer.op {
+            Op::Conv2d(conv) if conv.clip == Clip::NONE => {
+                let (weights, bias) = fold(&conv.weights, conv.bias.as_ref(), norm);
+                Op::Conv2d(Conv2d { weights, bias, ..conv.clone() })
+            }
+            Op::Linear(linear) if linear.clip == Clip::NONE => {
+                let (weights, bias) = fold(&linear.weights, linear.bias.as_ref(), norm);
+                Op::Linear(Linear { weights, bias, ..linear.clone() })
+            }
+            _ => return None,
+        };
+        Some((op, producer.inputs.clone()))
     });
 }
 
+type Folded = (Arc<Weights>, Option<Arc<Vec<f32>>>);
+
 /// In `f64`, rounded once to `f32`.
-fn fold(conv: &Conv2d, norm: &BatchNorm) -> Conv2d {
+fn fold(weights: &Weights, bias: Option<&Arc<Vec<f32>>>, norm: &BatchNorm) -> Folded {
     let factor = |o: usize| {
         let deviation = (f64::from(norm.variance[o]) + f64::from(norm.epsilon)).sqrt();
         f64::from(norm.weight[o]) / deviation
     };
     let outputs = norm.weight.len();
-    let depth = conv.weights.data.len() / outputs;
-    let mut data = Vec::with_capacity(conv.weights.data.len());
-    let mut bias = Vec::with_capacity(outputs);
+    let depth = weights.data.len() / outputs;
+    let mut data = Vec::with_capacity(weights.data.len());
+    let mut new_bias = Vec::with_capacity(outputs);
     for o in 0..outputs {
         let factor = factor(o);
-        let weights = &conv.weights.data[o * depth..(o + 1) * depth];
-        data.extend(weights.iter().map(|&w| (f64::from(w) * factor) as f32));
-        let old = conv.bias.as_ref().map_or(0.0, |b| f64::from(b[o]));
-        bias.push(((old - f64::from(norm.mean[o])) * factor + f64::from(norm.bias[o])) as f32);
+        let row = &weights.data[o * depth..(o + 1) * depth];
+        data.extend(row.iter().map(|&w| (f64::from(w) * factor) as f32));
+        let old = bias.map_or(0.0, |b| f64::from(b[o]));
+        new_bias.push(((old - f64::from(norm.mean[o])) * factor + f64::from(norm.bias[o])) as f32);
     }
-    let weights = Arc::new(Weights { shape: conv.weights.shape.clone(), data });
-    Conv2d { weights, bias: Some(Arc::new(bias)), ..conv.clone() }
+    (Arc::new(Weights { shape: weights.shape.clone(), data }), Some(Arc::new(new_bias)))
 }
 
 #[cfg(test)]
@@ -64,6 +77,22 @@ mod tests {
         assert!(folded.weights.data[..half].iter().zip(&before).all(|(new, old)| *new == 1.5 * old));
         assert!(folded.weights.data[half..].iter().zip(&before[half..]).all(|(new, old)| *new == 2.0 * old));
         assert_eq!(**folded.bias.as_ref().unwrap(), [-2.5, -1.0]);
+    }
+
+    #[test]
+    fn linear_layer_takes_the_norm_too() {
+        let (mut graph, rgb) = image();
+        let weights = Arc::new(Weights { shape: vec![2, 3], data: vec![1.0, 2.0, 3.0, 4.0, 5.0, 6.0] });
+        let linear = Op::Linear(Linear { weights, bias: Some(Arc::new(vec![1.0, -1.0])), clip: Clip::NONE });
+        let x = graph.push("fc", linear, &[rgb]).unwrap();
+        let y = batch_norm(&mut graph, "bn", x);
+        graph.outputs.push(y);
+        run(&mut graph);
+        let factor = f64::from(1.0 + 1e-5_f32).sqrt().recip();
+        let Op::Linear(folded) = &graph.producer(y).unwrap().op else { panic!() };
+        let close = |(a, b): (&f32, f64)| (f64::from(*a) - b * factor).abs() < 1e-6;
+        assert!(folded.weights.data.iter().zip([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]).all(close));
+        assert!(folded.bias.as_ref().unwrap().iter().zip([1.0, -1.0]).all(close));
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use super::factors::{self, Factor, Terms, bits};
 use super::{Builder, bounds_of, tables};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Node, ValueId};
+use crate::ir::{Clip, Node, ValueId};
 use crate::qmodel::{Bounds, QOp, QTensorId, QTerm};
 use firmware::program::Window;
 
@@ -36,7 +36,7 @@ impl Builder<'_> {
             input_zero_point: self.zero_point(input),
             requant,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         self.step(node, op, bounds_of(bits(bound), &[bound * f64::from(requant.multiplier)], 0.0));
         Ok(())
@@ -59,13 +59,13 @@ impl Builder<'_> {
             output,
             shift: terms.shift,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         self.step(node, op, Self::sum_bounds(&terms, largest));
         Ok(())
     }
 
-    pub(super) fn add(&mut self, node: &Node, relu: bool) -> Result<()> {
+    pub(super) fn add(&mut self, node: &Node, clip: Clip) -> Result<()> {
         let output = self.tensor(node.output);
         let (a, b) = (self.tensor(node.inputs[0]), self.tensor(node.inputs[1]));
         let factors = [self.factor(a, output, 1.0, 1.0), self.factor(b, output, 1.0, 1.0)];
@@ -76,9 +76,11 @@ impl Builder<'_> {
             output,
             shift: terms.shift,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, relu),
+            clamp: self.clamp(output, clip),
         };
-        self.step(node, op, Self::sum_bounds(&terms, factors[0].bound.max(factors[1].bound)));
+        let mut bounds = Self::sum_bounds(&terms, factors[0].bound.max(factors[1].bound));
+        bounds.clipped = self.clipped(output, clip);
+        self.step(node, op, bounds);
         Ok(())
     }
 
@@ -100,7 +102,7 @@ impl Builder<'_> {
             weight_bits,
             shift: terms.shift,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         let weighted = self.magnitude(input) * f64::exp2(2.0 * f64::from(weight_bits));
         self.step(node, op, Self::sum_bounds(&terms, weighted));

@@ -3,8 +3,9 @@
 use super::factors::{self, Factor, bits, round};
 use super::{Builder, bounds_of, tables};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{LayerNorm, Node, Tokens};
+use crate::ir::{Clip, LayerNorm, Node, Tokens};
 use crate::qmodel::{QOp, QTensorId, QTokenSource};
+use firmware::tensor::ElementType;
 
 /// Largest row, head and channel counts for which the bounds of the numerics page hold.
 const MAX_TOKENS: u32 = 512;
@@ -73,7 +74,7 @@ impl Builder<'_> {
             position,
             shift: terms.shift,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         self.step(node, op, bounds_of(bits(accumulator), &[terms.bound], terms.rounding));
         Ok(())
@@ -113,7 +114,7 @@ impl Builder<'_> {
             offsets: offsets.iter().map(|b| round(b * offset_unit) as i64).collect(),
             shift: shift as u8,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         self.step(node, op, bounds_of(bits(c * self.code_magnitude(input)), &[product, variance_bound], 0.0));
         Ok(())
@@ -124,6 +125,13 @@ impl Builder<'_> {
         let output = self.tensor(node.output);
         let shape = self.model.tensor(query).shape;
         let width = shape.channels / heads;
+        for operand in [query, key, value].map(|id| self.model.tensor(id)) {
+            if operand.element != ElementType::I8 || operand.zero_point != 0 {
+                let message = "found affine or 16-bit codes, expected symmetric 8-bit ones";
+                return Err(Error::new(ErrorCode::Unsupported, format!("operand {}", operand.name), message)
+                    .with_help("give attention the outputs of linear layers of their own"));
+            }
+        }
         if shape.positions() > MAX_TOKENS {
             return Err(too_large("attention tokens", shape.positions(), MAX_TOKENS));
         }
@@ -146,7 +154,7 @@ impl Builder<'_> {
             exp_table: tables::exp2_table(),
             requant,
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, false),
+            clamp: self.clamp(output, Clip::NONE),
         };
         // |A·R_s| ≤ 127·2^(c+22), c ≤ 24: one bit below 2^53 for 512 keys.
         let normalized = 127.0 * f64::exp2(f64::from(bits(f64::from(shape.positions()) * 32767.0)) + 22.0);

@@ -7,11 +7,15 @@
 //! | queries, keys, values | i8 symmetric |
 //! | residual stream of a transformer | i16, one scale for all its taps |
 //! | skip values of the ResNets | i8 affine, or i16 per stage |
-//! | global pools and the vectors behind them | i16 |
+//! | global pools and the vectors behind them, logits of a softmax | i16 |
+//! | probabilities | i16, scale 2^-15 |
 //! | GRU start state | i16, a power of two |
 //! | velocity, goal, waypoints | fixed point |
+//!
+//! Pools, slices and pads copy codes, so what they give is stored like what they read (`copies`).
 
 use super::QuantizeOptions;
+use super::copies;
 use super::factors::round;
 use super::ranges::{Quantization, affine_i8, symmetric_i8, symmetric_i16};
 use crate::calibrate::Statistics;
@@ -44,15 +48,25 @@ impl Stored {
         }
     }
 
+    /// Whether equal codes stand for equal values.
+    pub fn holds_like(&self, other: &Self) -> bool {
+        (self.element, self.scale, self.zero_point) == (other.element, other.scale, other.zero_point)
+    }
+
     fn i16(q: Quantization) -> Self {
         Self { element: ElementType::I16, ..Self::i8(q) }
     }
 
     /// The representable real value nearest to `x`.
     pub fn rounded(&self, x: f64) -> f64 {
+        self.code(x) * self.scale
+    }
+
+    /// The same in units of the scale: `q − z`, an integer.
+    pub fn code(&self, x: f64) -> f64 {
         let (min, max) = super::code_range(self.element);
         let z = f64::from(self.zero_point);
-        (round(x / self.scale + z).clamp(f64::from(min), f64::from(max)) - z) * self.scale
+        round(x / self.scale + z).clamp(f64::from(min), f64::from(max)) - z
     }
 
     fn fixed(element: ElementType, scale: f64, zero_point: i32) -> Self {
@@ -82,7 +96,7 @@ impl Types {
 
 /// Role of a value, found from the graph alone.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Role {
+pub(super) enum Role {
     Input(InputKind),
     /// An ordinary i8 activation.
     Narrow,
@@ -97,6 +111,8 @@ enum Role {
     /// Start state of the decoder.
     Hidden,
     Waypoints,
+    /// Results of a softmax.
+    Probabilities,
 }
 
 /// Decides the storage of every value.
@@ -106,11 +122,12 @@ enum Role {
 pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions) -> Result<Types> {
     let roles = roles(graph);
     let stages = stages(graph);
+    let borders = copies::borders(graph, statistics);
     let stream_maxima = stream_maxima(graph, statistics, options, &roles);
     let mut types: Vec<Stored> = Vec::with_capacity(graph.values.len());
     for (index, role) in roles.iter().enumerate() {
         let id = ValueId(index as u32);
-        let seen = statistics.of(id);
+        let seen = statistics.of(*borders.get(&id).unwrap_or(&id));
         let narrow = || Stored::i8(affine_i8(seen, options.ranges));
         types.push(match *role {
             Role::Input(InputKind::Image) => Stored::fixed(ElementType::I8, 1.0, -128),
@@ -125,15 +142,17 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
             Role::Skip => narrow(),
             Role::Vector => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
             Role::Hidden => hidden_state(seen.max_abs()),
+            Role::Probabilities => Stored::fixed(ElementType::I16, f64::exp2(-15.0), 0),
         });
     }
-    same_scale_across_max_pool(graph, &mut types);
+    copies::share_storage(graph, &roles, &mut types);
     if !options.own_pool_scale {
         for node in graph.nodes.iter().filter(|n| matches!(n.op, Op::GlobalPool)) {
             types[node.output.0 as usize].scale = types[node.inputs[0].0 as usize].scale;
         }
     }
-    let convolved = graph.nodes.iter().filter(|n| matches!(n.op, Op::Conv2d(_))).map(|n| n.inputs[0]);
+    let convolves = |n: &&Node| matches!(&n.op, Op::Conv2d(c) if !super::is_linear(c, graph.value(n.inputs[0]).shape));
+    let convolved = graph.nodes.iter().filter(convolves).map(|n| n.inputs[0]);
     let wide = convolved.filter(|id| types[id.0 as usize].element != ElementType::I8);
     let narrowed = wide.map(|id| (id, Stored::i8(affine_i8(statistics.of(id), options.ranges)))).collect();
     Ok(Types { stored: types, narrowed })
@@ -150,6 +169,8 @@ fn roles(graph: &Graph) -> Vec<Role> {
     let mut streams = 0;
     for node in &graph.nodes {
         let of = |k: usize| node.inputs.get(k).map(|id: &ValueId| roles[id.0 as usize]);
+        let wide = |k: usize| matches!(of(k), Some(Role::Vector | Role::Probabilities));
+        let shape = |k: usize| graph.value(node.inputs[k]).shape;
         let role = match &node.op {
             Op::Input(kind) => Role::Input(*kind),
             Op::Tokens(_) => {
@@ -163,11 +184,17 @@ fn roles(graph: &Graph) -> Vec<Role> {
             },
             Op::Add { .. } => match (of(0), of(1)) {
                 (Some(stream @ Role::Stream(_)), _) | (_, Some(stream @ Role::Stream(_))) => stream,
+                (Some(Role::Vector), _) | (_, Some(Role::Vector)) => Role::Vector,
                 _ => Role::Skip,
             },
+            Op::Conv2d(conv) if of(0) == Some(Role::Vector) && super::is_linear(conv, shape(0)) => Role::Vector,
             Op::Conv2d(_) if node.inputs.len() == 2 => Role::Skip,
             Op::ResizeBilinear { .. } if node.inputs.len() == 2 => Role::Skip,
             Op::GlobalPool => Role::Vector,
+            Op::AveragePool(_) if graph.value(node.output).shape.positions() == 1 => Role::Vector,
+            Op::Concat(_) if (0..node.inputs.len()).any(wide) => Role::Vector,
+            Op::Slice(_) | Op::Pad(_) | Op::Clip(_) if of(0) == Some(Role::Vector) => Role::Vector,
+            Op::Softmax => Role::Probabilities,
             Op::WaypointDecoder(_) => Role::Waypoints,
             _ => Role::Narrow,
         };
@@ -180,9 +207,18 @@ fn roles(graph: &Graph) -> Vec<Role> {
                 (Op::Attention { .. }, Role::Narrow) => *role = Role::Symmetric,
                 (Op::WaypointDecoder(_), _) => *role = Role::Hidden,
                 (Op::Attention { .. }, _) => {}
+                (Op::Softmax, Role::Narrow | Role::Skip) => *role = Role::Vector,
+                (Op::Softmax, _) => {}
                 (_, Role::Narrow) => *role = Role::Skip,
                 _ => {}
             }
+        }
+    }
+    // What a copy's reader asks for, its operand must give.
+    for node in graph.nodes.iter().rev().filter(|node| copies::is_copy(&node.op)) {
+        let (result, operand) = (roles[node.output.0 as usize], &mut roles[node.inputs[0].0 as usize]);
+        if *operand == Role::Narrow && matches!(result, Role::Symmetric | Role::Hidden | Role::Skip | Role::Vector) {
+            *operand = result;
         }
     }
     roles
@@ -192,7 +228,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
 fn promoted(node: &Node) -> Vec<ValueId> {
     match &node.op {
         Op::Attention { .. } => node.inputs.clone(),
-        Op::WaypointDecoder(_) => vec![node.inputs[0]],
+        Op::WaypointDecoder(_) | Op::Softmax => vec![node.inputs[0]],
         Op::Conv2d(_) | Op::ResizeBilinear { .. } => node.inputs.iter().skip(1).copied().collect(),
         Op::MaxPool(_) => vec![node.inputs[0], node.output],
         _ => Vec::new(),
@@ -227,13 +263,4 @@ fn stream_maxima(graph: &Graph, statistics: &Statistics, options: &QuantizeOptio
         }
     }
     maxima
-}
-
-/// A max pool copies codes: its output is stored like its input.
-fn same_scale_across_max_pool(graph: &Graph, types: &mut [Stored]) {
-    for node in &graph.nodes {
-        if matches!(node.op, Op::MaxPool(_)) {
-            types[node.output.0 as usize] = types[node.inputs[0].0 as usize];
-        }
-    }
 }

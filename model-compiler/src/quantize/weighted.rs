@@ -1,11 +1,13 @@
 //! Convolutions and linear layers: i8 weights per output channel, effective bias, epilogue.
 
 use super::factors::{self, Factor, bits, round};
+use super::rounding::Rounding;
 use super::{Builder, bounds_of};
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Conv2d, Linear, Node, Normalization, ValueId};
+use crate::ir::{Clip, Conv2d, Linear, Node, Normalization, Weights};
 use crate::qmodel::{Bounds, QOp, QRescale, QResidual, QTensorId};
 use firmware::tensor::ElementType;
+use std::sync::Arc;
 
 /// Bits that an accumulator may have before it is multiplied, in the plain form and as a term of a sum.
 const REQUANT_ACCUMULATOR_BITS: u32 = 28;
@@ -19,7 +21,7 @@ struct Layer<'a> {
     inputs: usize,
     groups: usize,
     normalization: Option<&'a Normalization>,
-    relu: bool,
+    clip: Clip,
 }
 
 impl Layer<'_> {
@@ -47,6 +49,12 @@ struct IntegerLayer {
 
 impl Builder<'_> {
     pub(super) fn conv2d(&mut self, node: &Node, conv: &Conv2d) -> Result<()> {
+        if super::is_linear(conv, self.graph.value(node.inputs[0]).shape) {
+            let weights =
+                Weights { shape: vec![conv.weights.shape[0], conv.weights.shape[3]], ..(*conv.weights).clone() };
+            let linear = Linear { weights: Arc::new(weights), bias: conv.bias.clone(), clip: conv.clip };
+            return self.linear(node, &linear);
+        }
         let input = self.narrow(node.inputs[0])?;
         let layer = Layer {
             weights: &conv.weights.data,
@@ -55,7 +63,7 @@ impl Builder<'_> {
             inputs: conv.weights.shape[3],
             groups: usize::from(conv.groups),
             normalization: conv.normalization.as_deref(),
-            relu: conv.relu,
+            clip: conv.clip,
         };
         let (weights, rescale, bounds, _) = self.weighted(node, &layer, input)?;
         let output = self.tensor(node.output);
@@ -77,7 +85,7 @@ impl Builder<'_> {
             inputs: linear.weights.shape[1],
             groups: 1,
             normalization: None,
-            relu: linear.relu,
+            clip: linear.clip,
         };
         let (weights, rescale, bounds, wide) = self.weighted(node, &layer, input)?;
         let output = self.tensor(node.output);
@@ -93,7 +101,7 @@ impl Builder<'_> {
     ) -> Result<(Vec<i8>, QRescale, Bounds, bool)> {
         let output = self.tensor(node.output);
         let residual = node.inputs.get(1).map(|&value| self.tensor(value));
-        let integer = self.integer_layer(node.inputs[0], layer, input, output)?;
+        let integer = self.integer_layer(node, layer, input, output)?;
         let (rescale, mut bounds) = self.rescale(layer, &integer, input, output, residual)?;
         let half = f64::exp2(f64::from(rescale.pre_shift)) / 2.0;
         let accumulator_bits = bits(integer.partial_bound + half);
@@ -107,6 +115,7 @@ impl Builder<'_> {
             .with_help("split the layer into groups of input channels"));
         }
         bounds.accumulator_bits = accumulator_bits as u8;
+        bounds.clipped = self.clipped(output, layer.clip);
         let spare = if wide { 63 - accumulator_bits } else { 31 - accumulator_bits };
         bounds.headroom_bits = bounds.headroom_bits.min(spare as u8);
         Ok((integer.weights, rescale, bounds, wide))
@@ -114,17 +123,22 @@ impl Builder<'_> {
 
     fn integer_layer(
         &self,
-        source: ValueId,
+        node: &Node,
         layer: &Layer<'_>,
         input: QTensorId,
         output: QTensorId,
     ) -> Result<IntegerLayer> {
+        let source = node.inputs[0];
         let (input_scale, output_scale) = (self.scale(input), self.scale(output));
         let zero_point = f64::from(self.zero_point(input));
         let magnitude = self.magnitude(input);
         let raw_magnitude = if self.model.tensor(input).element == ElementType::I8 { 383.0 } else { 32768.0 };
         let means = &self.statistics.of(source).channel_mean;
         let quantized_means = &self.quantized_means[source.0 as usize];
+        let roundings: Vec<Rounding> = match self.covariances.of(node.output) {
+            Some(covariances) => covariances.iter().map(Rounding::by).collect(),
+            None => vec![Rounding::nearest(); layer.groups],
+        };
         let mut integer = IntegerLayer {
             weights: Vec::with_capacity(layer.weights.len()),
             weight_scales: Vec::with_capacity(layer.outputs),
@@ -139,7 +153,7 @@ impl Builder<'_> {
             let scale = (largest / 127.0)
                 .max(bias.abs() / (input_scale * f64::exp2(27.0)))
                 .max(f64::exp2(-26.0) * output_scale / input_scale);
-            let codes: Vec<f64> = row.iter().map(|w| round(w / scale).clamp(-127.0, 127.0)).collect();
+            let codes = roundings[o / (layer.outputs / layer.groups)].round(&row, scale);
             let mean_of = |k: usize| layer.normalization.map_or(0.0, |n| f64::from(n.mean[layer.channel(o, k)]));
             if self.options.bias_correction {
                 // What the layer gives on average with quantized weights and inputs, less what it should give.
@@ -181,7 +195,7 @@ impl Builder<'_> {
             multipliers: Vec::with_capacity(layer.outputs),
             shifts: Vec::with_capacity(layer.outputs),
             zero_point: self.zero_point(output),
-            clamp: self.clamp(output, layer.relu),
+            clamp: self.clamp(output, layer.clip),
             residual: QResidual::None,
         };
         let in_stream = residual.is_some_and(|r| {

@@ -31,7 +31,7 @@ pub(super) fn conv2d(conv: &Conv2d, shape: Shape, inputs: &[&[f32]], output: Sha
             panels.multiply(&rows, out, outputs, group * outputs_per_group);
         }
     });
-    finish(&mut out, conv.bias.as_ref().map(|b| &b[..]), inputs.get(1).copied(), conv.relu);
+    finish(&mut out, conv.bias.as_ref().map(|b| &b[..]), inputs.get(1).copied(), conv.clip);
     out
 }
 
@@ -78,6 +78,7 @@ pub(super) fn tap(out: usize, stride: u8, k: u8, dilation: u8, pad: u8, size: us
 mod tests {
     use super::super::testing::{assert_close, values};
     use super::*;
+    use crate::ir::Clip;
     use crate::ir::{Normalization, Op, Weights};
     use proptest::prelude::*;
     use std::sync::Arc;
@@ -113,7 +114,7 @@ mod tests {
                         }
                     }
                     let sum = sum + residual.map_or(0.0, |r| f64::from(r[out.len()]));
-                    out.push(if conv.relu { sum.max(0.0) } else { sum });
+                    out.push(sum.clamp(f64::from(conv.clip.min), f64::from(conv.clip.max)));
                 }
             }
         }
@@ -146,7 +147,8 @@ mod tests {
             window in windows(), height in 5..11_u16, width in 5..11_u16, groups in 1..4_u16, inputs in 1..4_u16,
             outputs in 1..9_u16, options in any::<[bool; 4]>(), seed: u64,
         ) {
-            let [with_bias, relu, with_residual, with_normalization] = options;
+            let [with_bias, clipped, with_residual, with_normalization] = options;
+            let clip = if clipped { Clip { min: 0.0, max: 1.5 } } else { Clip::NONE };
             let (inputs, outputs) = (inputs * groups, outputs * groups);
             let dims = [outputs, u16::from(window.kernel_h), u16::from(window.kernel_w), inputs / groups];
             let dims = dims.map(usize::from).to_vec();
@@ -157,7 +159,7 @@ mod tests {
             let conv = Conv2d {
                 weights: Arc::new(Weights { data: values(seed ^ 3, dims.iter().product()), shape: dims }),
                 bias: with_bias.then(|| Arc::new(values(seed ^ 4, outputs.into()))),
-                window, groups, normalization, relu,
+                window, groups, normalization, clip,
             };
             let shape = Shape::map(height, width, inputs);
             let output = Op::Conv2d(conv.clone()).output_shape(&[shape]).unwrap();

@@ -13,7 +13,7 @@ pub(super) fn linear(linear: &Linear, inputs: &[&[f32]]) -> Vec<f32> {
     out.par_chunks_mut(ROWS_PER_TASK * outputs)
         .zip(inputs[0].par_chunks(ROWS_PER_TASK * depth))
         .for_each(|(out, rows)| panels.multiply(rows, out, outputs, 0));
-    finish(&mut out, linear.bias.as_ref().map(|b| &b[..]), inputs.get(1).copied(), linear.relu);
+    finish(&mut out, linear.bias.as_ref().map(|b| &b[..]), inputs.get(1).copied(), linear.clip);
     out
 }
 
@@ -21,6 +21,7 @@ pub(super) fn linear(linear: &Linear, inputs: &[&[f32]]) -> Vec<f32> {
 mod tests {
     use super::super::testing::{assert_close, values};
     use super::*;
+    use crate::ir::Clip;
     use crate::ir::Weights;
     use proptest::prelude::*;
     use std::sync::Arc;
@@ -32,10 +33,11 @@ mod tests {
             seed: u64,
         ) {
             let [with_bias, relu, with_residual] = options;
+            let clip = if relu { Clip::RELU } else { Clip::NONE };
             let layer = Linear {
                 weights: Arc::new(Weights { shape: vec![outputs, depth], data: values(seed, outputs * depth) }),
                 bias: with_bias.then(|| Arc::new(values(seed ^ 1, outputs))),
-                relu,
+                clip,
             };
             let x = values(seed ^ 2, rows * depth);
             let residual = values(seed ^ 3, rows * outputs);

@@ -1,7 +1,7 @@
 //! Enlargement by a whole factor with half-pixel centers (`align_corners = False`).
 
 use super::elementwise::finish;
-use crate::ir::Shape;
+use crate::ir::{Clip, Shape};
 
 /// Two neighbors along one axis and the weight of the second.
 #[derive(Clone, Copy)]
@@ -29,7 +29,7 @@ pub(super) fn resize_bilinear(factor: (u16, u16), shape: Shape, inputs: &[&[f32]
             }));
         }
     }
-    finish(&mut out, None, inputs.get(1).copied(), false);
+    finish(&mut out, None, inputs.get(1).copied(), Clip::NONE);
     out
 }
 

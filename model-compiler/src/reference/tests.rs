@@ -1,7 +1,7 @@
 //! Whole small graphs.
 
 use super::*;
-use crate::ir::{Linear, Normalization, Weights};
+use crate::ir::{Clip, Linear, Normalization, Weights};
 use std::sync::Arc;
 
 /// BEV → ReLU → add(BEV), and a branch that nobody reads.
@@ -10,9 +10,9 @@ fn small() -> Graph {
     let bev = graph.push_input("bev", InputKind::Bev, Shape::map(1, 2, 2));
     let negative = Op::Normalize(Arc::new(Normalization { mean: vec![0.5, 0.0], std: vec![1.0, -1.0] }));
     let shifted = graph.push("shifted", negative, &[bev]).unwrap();
-    let relu = graph.push("relu", Op::Relu, &[shifted]).unwrap();
+    let relu = graph.push("relu", Op::Clip(Clip::RELU), &[shifted]).unwrap();
     graph.push("unread", Op::GlobalPool, &[shifted]).unwrap();
-    let sum = graph.push("sum", Op::Add { relu: false }, &[relu, bev]).unwrap();
+    let sum = graph.push("sum", Op::Add { clip: Clip::NONE }, &[relu, bev]).unwrap();
     graph.outputs = vec![sum, relu];
     graph
 }
@@ -75,10 +75,10 @@ fn a_fused_operator_equals_its_chain() {
     let weights = Arc::new(Weights { shape: vec![7, 5], data: testing::values(3, 7 * 5) });
     let bias = Some(Arc::new(testing::values(4, 7)));
     let (input, output) = (Shape::tokens(6, 5), Shape::tokens(6, 7));
-    let layer = |relu: bool| Op::Linear(Linear { weights: weights.clone(), bias: bias.clone(), relu });
+    let layer = |clip: Clip| Op::Linear(Linear { weights: weights.clone(), bias: bias.clone(), clip });
 
-    let apart = evaluate(&layer(false), &[input], &[&x], output);
-    let apart = evaluate(&Op::Add { relu: false }, &[output, output], &[&apart, &residual], output);
-    let apart = evaluate(&Op::Relu, &[output], &[&apart], output);
-    assert_eq!(evaluate(&layer(true), &[input, output], &[&x, &residual], output), apart);
+    let apart = evaluate(&layer(Clip::NONE), &[input], &[&x], output);
+    let apart = evaluate(&Op::Add { clip: Clip::NONE }, &[output, output], &[&apart, &residual], output);
+    let apart = evaluate(&Op::Clip(Clip::RELU), &[output], &[&apart], output);
+    assert_eq!(evaluate(&layer(Clip::RELU), &[input, output], &[&x, &residual], output), apart);
 }

@@ -37,8 +37,11 @@ pub mod ids {
     pub const VECTOR: u16 = 20;
     pub const HIDDEN: u16 = 21;
     pub const WAYPOINTS: u16 = 22;
+    pub const BOX: u16 = 23;
+    pub const JOINED: u16 = 24;
+    pub const PROBABILITIES: u16 = 25;
     /// First scratch record.
-    pub const SCRATCH: u16 = 23;
+    pub const SCRATCH: u16 = 26;
 }
 
 /// Positions of the sample's steps.
@@ -60,9 +63,12 @@ pub mod at {
     pub const GLOBAL_POOL: usize = 16;
     pub const LINEAR_WIDE: usize = 17;
     pub const DECODER: usize = 18;
+    pub const COPY_BOX: usize = 19;
+    pub const CONCAT: usize = 20;
+    pub const SOFTMAX: usize = 21;
 }
 
-pub const STEPS: usize = 19;
+pub const STEPS: usize = 22;
 
 /// Deterministic constants.
 struct Numbers {
@@ -145,7 +151,7 @@ pub fn parts() -> ImageParts {
             port("velocity", ids::VELOCITY),
             port("goal", ids::GOAL),
         ],
-        outputs: vec![port("waypoints", ids::WAYPOINTS)],
+        outputs: vec![port("waypoints", ids::WAYPOINTS), port("probabilities", ids::PROBABILITIES)],
         arena_bytes,
         arena_alignment: 16,
         qmodel_digest: [7; 32],
@@ -180,6 +186,9 @@ fn shapes() -> Vec<(Shape, ElementType)> {
         (Shape::vector(8), I16),
         (Shape::vector(8), I16),
         (Shape::tokens(4, 2), I32),
+        (Shape::map(3, 4, 8), I8),
+        (Shape::map(7, 4, 8), I16),
+        (Shape::map(7, 4, 8), I16),
     ]
 }
 
@@ -237,6 +246,17 @@ fn steps(n: &mut Numbers) -> Vec<Step> {
         }),
         linear(n, ids::VECTOR, (ids::HIDDEN, I16), true, Residual::None),
         decoder(n),
+        Step::CopyBox(CopyBox {
+            input: TensorId(ids::BLOCK),
+            output: TensorId(ids::BOX),
+            begin: [1, 0, 2],
+            stride: [2, 1, 3],
+            size: [2, 3, 2],
+            before: [0, 1, 3],
+            border: -3,
+        }),
+        concat(),
+        softmax(n),
     ]
 }
 
@@ -310,9 +330,11 @@ fn layer_norm(n: &mut Numbers, input: u16, output: u16, first_row: u16) -> Step 
     })
 }
 
+fn exp_table() -> Vec<i16> {
+    (0..257).map(|k| (2_f64.powf(15.0 - f64::from(k) / 256.0)).round().min(32767.0) as i16).collect()
+}
+
 fn attention(n: &mut Numbers) -> Step {
-    let table: Vec<i16> =
-        (0..257).map(|k| (2_f64.powf(15.0 - f64::from(k) / 256.0)).round().min(32767.0) as i16).collect();
     Step::Attention(Attention {
         query: TensorId(ids::QUERY),
         key: TensorId(ids::KEY),
@@ -320,7 +342,7 @@ fn attention(n: &mut Numbers) -> Step {
         output: TensorId(ids::CONTEXT),
         heads: 2,
         exponent: requant(),
-        exp_table: n.builder.push(&table).expect("fits"),
+        exp_table: n.builder.push(&exp_table()).expect("fits"),
         requant: requant(),
         zero_point: 0,
         clamp: clamp(I8),
@@ -370,6 +392,27 @@ fn decoder(n: &mut Numbers) -> Step {
     })
 }
 
+fn concat() -> Step {
+    let source = |tensor, zero_point| ConcatSource { tensor: TensorId(tensor), zero_point, requant: requant() };
+    Step::Concat(Concat {
+        first: source(ids::BOX, -3),
+        second: source(ids::BLOCK, -3),
+        output: TensorId(ids::JOINED),
+        axis: Axis::Height,
+        zero_point: 0,
+        clamp: clamp(I16),
+    })
+}
+
+fn softmax(n: &mut Numbers) -> Step {
+    Step::Softmax(Softmax {
+        input: TensorId(ids::JOINED),
+        output: TensorId(ids::PROBABILITIES),
+        exponent: Requant { shift: 12, ..requant() },
+        exp_table: n.builder.push(&exp_table()).expect("fits"),
+    })
+}
+
 /// Pairs of output and overwritten operand.
 fn in_place(shapes: &[(Shape, ElementType)]) -> Vec<(u16, u16)> {
     let mut pairs = vec![
@@ -378,6 +421,7 @@ fn in_place(shapes: &[(Shape, ElementType)]) -> Vec<(u16, u16)> {
         (ids::FUSED, ids::POOLED),
         (ids::SUM, ids::LIDAR_NARROW),
         (ids::BLOCK, ids::FUSED),
+        (ids::PROBABILITIES, ids::JOINED),
     ];
     let [input, output] = [ids::STEM, ids::POOLED].map(|id| shapes[usize::from(id)].0);
     if plan::max_pool_in_place(input, output, Window::square(2, 2, 0)) {

@@ -132,17 +132,13 @@ impl<'a> RowScratch<'a> {
 #[cfg(test)]
 mod tests {
     extern crate std;
-    use super::super::oracle::{Rng, Scratch, clamp, for_seeds, round};
+    use super::super::oracle::{Rng, Scratch, clamp, exp_table, for_seeds, round};
     use super::*;
     use crate::kernels::RequantArgs;
     use crate::kernels::plan::attention_scratch_bytes;
     use crate::program::{Clamp, Requant};
     use crate::tensor::ElementType;
     use std::vec::Vec;
-
-    fn table() -> [i16; EXP_TABLE_LEN] {
-        core::array::from_fn(|k| f64::min(32767.0, (32768.0 * f64::exp2(-(k as f64) / 256.0)).round()) as i16)
-    }
 
     fn expected(args: &AttentionArgs<'_>, query: &[i8], key: &[i8], value: &[i8]) -> Vec<i128> {
         let (tokens, channels) = (args.tokens as usize, usize::from(args.channels));
@@ -178,7 +174,7 @@ mod tests {
         let count = tokens as usize * usize::from(channels);
         let [query, key, value] = [(); 3].map(|()| rng.values::<i8>(count, -127, 127));
         let to = rng.element_type();
-        let table = table();
+        let table = exp_table();
         let span = if to == ElementType::I8 { 7 } else { 15 };
         let args = AttentionArgs {
             tokens,
@@ -221,7 +217,7 @@ mod tests {
 
     #[test]
     fn equal_logits_average_the_values() {
-        let table = table();
+        let table = exp_table();
         let args = AttentionArgs {
             tokens: 4,
             channels: 1,

@@ -5,7 +5,7 @@ use crate::tensor::Codes;
 use bytemuck::{AnyBitPattern, NoUninit};
 
 /// An element type of activations.
-pub(crate) trait Code: Copy + Ord {
+pub(in crate::kernels) trait Code: Copy + Ord {
     /// The smallest code.
     const LOWEST: Self;
     /// Code 0.
@@ -50,13 +50,13 @@ impl Code for i16 {
 
 /// A code as a term of a sum.
 #[inline]
-pub(super) fn value<T: Code>(code: T) -> i64 {
+pub(in crate::kernels) fn value<T: Code>(code: T) -> i64 {
     i64::from(code.widen())
 }
 
 /// Element `index` of an operand, or `stored` (the same element of the output buffer) where it is in place.
 #[inline]
-pub(super) fn operand<T: Code>(codes: Option<Codes<'_>>, index: usize, stored: T) -> i64 {
+pub(in crate::kernels) fn operand<T: Code>(codes: Option<Codes<'_>>, index: usize, stored: T) -> i64 {
     match codes {
         None => value(stored),
         Some(Codes::I8(codes)) => i64::from(element(codes, index)),
@@ -65,7 +65,7 @@ pub(super) fn operand<T: Code>(codes: Option<Codes<'_>>, index: usize, stored: T
 }
 
 /// Elements of an operand; of one in place, `stored`.
-pub(crate) fn operand_len(codes: Option<Codes<'_>>, stored: usize) -> usize {
+pub(in crate::kernels) fn operand_len(codes: Option<Codes<'_>>, stored: usize) -> usize {
     match codes {
         None => stored,
         Some(Codes::I8(codes)) => codes.len(),
@@ -75,34 +75,37 @@ pub(crate) fn operand_len(codes: Option<Codes<'_>>, stored: usize) -> usize {
 
 /// `slice[index]`, or zero beyond the end.
 #[inline]
-pub(super) fn element<T: Copy + Default>(slice: &[T], index: usize) -> T {
+pub(in crate::kernels) fn element<T: Copy + Default>(slice: &[T], index: usize) -> T {
     slice.get(index).copied().unwrap_or_default()
 }
 
 /// `slice[index·len ..][..len]`, or `None` beyond the end.
 #[inline]
-pub(super) fn block<T>(slice: &[T], index: usize, len: usize) -> Option<&[T]> {
+pub(in crate::kernels) fn block<T>(slice: &[T], index: usize, len: usize) -> Option<&[T]> {
     let start = index.checked_mul(len)?;
     slice.get(start..start.checked_add(len)?)
 }
 
 /// Mutable [`block`].
 #[inline]
-pub(super) fn block_mut<T>(slice: &mut [T], index: usize, len: usize) -> Option<&mut [T]> {
+pub(in crate::kernels) fn block_mut<T>(slice: &mut [T], index: usize, len: usize) -> Option<&mut [T]> {
     let start = index.checked_mul(len)?;
     slice.get_mut(start..start.checked_add(len)?)
 }
 
 /// Copies codes to 16 bits.
 #[inline]
-pub(super) fn widen<T: Code>(codes: &[T], widened: &mut [i16]) {
+pub(in crate::kernels) fn widen<T: Code>(codes: &[T], widened: &mut [i16]) {
     for (wide, code) in widened.iter_mut().zip(codes) {
         *wide = code.widen();
     }
 }
 
 /// Takes `len` elements off the front of `scratch`; `None` where they do not fit or are not aligned.
-pub(crate) fn take<'a, T: NoUninit + AnyBitPattern>(scratch: &mut &'a mut [u8], len: usize) -> Option<&'a mut [T]> {
+pub(in crate::kernels) fn take<'a, T: NoUninit + AnyBitPattern>(
+    scratch: &mut &'a mut [u8],
+    len: usize,
+) -> Option<&'a mut [T]> {
     let bytes = len.checked_mul(size_of::<T>())?;
     let (front, rest) = core::mem::take(scratch).split_at_mut_checked(bytes)?;
     *scratch = rest;

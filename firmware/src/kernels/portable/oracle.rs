@@ -3,16 +3,17 @@
 
 extern crate std;
 
-use crate::kernels::{RescaleArgs, ResidualArgs, k4n16, plan};
-use crate::program::{Clamp, KernelId, Requant};
-use crate::tensor::{Codes, CodesMut, ElementType};
+use crate::fixed_point::EXP_TABLE_LEN;
+use crate::kernels::{PoolArgs, RescaleArgs, ResidualArgs, k4n16, plan};
+use crate::program::{Clamp, KernelId, Requant, Window};
+use crate::tensor::{Codes, CodesMut, ElementType, Shape};
 use std::vec::Vec;
 
 /// Any code.
-pub(super) const FULL: Clamp = Clamp { min: i16::MIN, max: i16::MAX };
+pub(in crate::kernels) const FULL: Clamp = Clamp { min: i16::MIN, max: i16::MAX };
 
 /// Runs `test` for `cases` seeds; the seed of a failing case is printed.
-pub(super) fn for_seeds(cases: u64, test: impl Fn(&mut Rng)) {
+pub(in crate::kernels) fn for_seeds(cases: u64, test: impl Fn(&mut Rng)) {
     struct Seed(u64);
     impl Drop for Seed {
         fn drop(&mut self) {
@@ -28,10 +29,10 @@ pub(super) fn for_seeds(cases: u64, test: impl Fn(&mut Rng)) {
 }
 
 /// SplitMix64.
-pub(super) struct Rng(pub u64);
+pub(in crate::kernels) struct Rng(pub u64);
 
 impl Rng {
-    pub(super) fn next(&mut self) -> u64 {
+    pub(in crate::kernels) fn next(&mut self) -> u64 {
         self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mut z = self.0;
         z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
@@ -40,16 +41,16 @@ impl Rng {
     }
 
     /// A value of `low..=high`.
-    pub(super) fn range(&mut self, low: i64, high: i64) -> i64 {
+    pub(in crate::kernels) fn range(&mut self, low: i64, high: i64) -> i64 {
         low + (self.next() % (high - low + 1) as u64) as i64
     }
 
-    pub(super) fn flag(&mut self) -> bool {
+    pub(in crate::kernels) fn flag(&mut self) -> bool {
         self.next() & 1 == 1
     }
 
     /// Random values of `low..=high`, one in eight an extreme.
-    pub(super) fn values<T: TryFrom<i64>>(&mut self, count: usize, low: i64, high: i64) -> Vec<T> {
+    pub(in crate::kernels) fn values<T: TryFrom<i64>>(&mut self, count: usize, low: i64, high: i64) -> Vec<T> {
         let value = |rng: &mut Self| match rng.next() % 16 {
             0 => low,
             1 => high,
@@ -58,11 +59,11 @@ impl Rng {
         (0..count).map(|_| T::try_from(value(self)).ok().unwrap()).collect()
     }
 
-    pub(super) fn element_type(&mut self) -> ElementType {
+    pub(in crate::kernels) fn element_type(&mut self) -> ElementType {
         if self.flag() { ElementType::I8 } else { ElementType::I16 }
     }
 
-    pub(super) fn buffer(&mut self, element_type: ElementType, count: usize) -> Buffer {
+    pub(in crate::kernels) fn buffer(&mut self, element_type: ElementType, count: usize) -> Buffer {
         match element_type {
             ElementType::I8 => Buffer::I8(self.values(count, -128, 127)),
             _ => Buffer::I16(self.values(count, -32768, 32767)),
@@ -70,12 +71,12 @@ impl Rng {
     }
 
     /// A zero point of this type.
-    pub(super) fn zero_point(&mut self, element_type: ElementType) -> i16 {
+    pub(in crate::kernels) fn zero_point(&mut self, element_type: ElementType) -> i16 {
         if element_type == ElementType::I8 { self.range(-128, 127) as i16 } else { 0 }
     }
 
     /// A clamp within this type, often the whole of it.
-    pub(super) fn clamp(&mut self, element_type: ElementType) -> Clamp {
+    pub(in crate::kernels) fn clamp(&mut self, element_type: ElementType) -> Clamp {
         let (min, max) = if element_type == ElementType::I8 { (-128, 127) } else { (i16::MIN, i16::MAX) };
         if self.flag() {
             return Clamp { min, max };
@@ -85,12 +86,12 @@ impl Rng {
     }
 
     /// A multiplier that stands alone.
-    pub(super) fn multiplier(&mut self) -> i32 {
+    pub(in crate::kernels) fn multiplier(&mut self) -> i32 {
         self.range(1 << 23, (1 << 24) - 1) as i32
     }
 
     /// A factor of about `2^(span − bits)`, which maps sums of `bits` digits to codes of about `span` digits.
-    pub(super) fn requant(&mut self, bits: i64, span: i64) -> Requant {
+    pub(in crate::kernels) fn requant(&mut self, bits: i64, span: i64) -> Requant {
         let jitter = self.range(-1, 3);
         Requant { multiplier: self.multiplier(), shift: (23 + bits - span + jitter).clamp(1, 52) as u8 }
     }
@@ -98,34 +99,34 @@ impl Rng {
 
 /// Codes of either type.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) enum Buffer {
+pub(in crate::kernels) enum Buffer {
     I8(Vec<i8>),
     I16(Vec<i16>),
 }
 
 impl Buffer {
-    pub(super) fn codes(&self) -> Codes<'_> {
+    pub(in crate::kernels) fn codes(&self) -> Codes<'_> {
         match self {
             Self::I8(codes) => Codes::I8(codes),
             Self::I16(codes) => Codes::I16(codes),
         }
     }
 
-    pub(super) fn codes_mut(&mut self) -> CodesMut<'_> {
+    pub(in crate::kernels) fn codes_mut(&mut self) -> CodesMut<'_> {
         match self {
             Self::I8(codes) => CodesMut::I8(codes),
             Self::I16(codes) => CodesMut::I16(codes),
         }
     }
 
-    pub(super) fn get(&self, index: usize) -> i128 {
+    pub(in crate::kernels) fn get(&self, index: usize) -> i128 {
         match self {
             Self::I8(codes) => codes[index].into(),
             Self::I16(codes) => codes[index].into(),
         }
     }
 
-    pub(super) fn len(&self) -> usize {
+    pub(in crate::kernels) fn len(&self) -> usize {
         match self {
             Self::I8(codes) => codes.len(),
             Self::I16(codes) => codes.len(),
@@ -133,7 +134,7 @@ impl Buffer {
     }
 
     /// Compares with expected codes, element by element.
-    pub(super) fn assert_equals(&self, expected: &[i128], what: &str) {
+    pub(in crate::kernels) fn assert_equals(&self, expected: &[i128], what: &str) {
         assert_eq!(self.len(), expected.len(), "{what}: length");
         for (index, expected) in expected.iter().enumerate() {
             assert_eq!(self.get(index), *expected, "{what}: element {index}");
@@ -142,18 +143,18 @@ impl Buffer {
 }
 
 /// Scratch of exactly `bytes` bytes, 16-byte aligned, full of garbage.
-pub(super) struct Scratch {
+pub(in crate::kernels) struct Scratch {
     words: Vec<u128>,
     bytes: usize,
 }
 
 impl Scratch {
-    pub(super) fn new(bytes: u32) -> Self {
+    pub(in crate::kernels) fn new(bytes: u32) -> Self {
         let bytes = bytes as usize;
         Self { words: std::vec![0x5a5a_a5a5_1234_fedc_8001_7fff_dead_beef; bytes.div_ceil(16)], bytes }
     }
 
-    pub(super) fn bytes(&mut self) -> &mut [u8] {
+    pub(in crate::kernels) fn bytes(&mut self) -> &mut [u8] {
         &mut bytemuck::cast_slice_mut(&mut self.words)[..self.bytes]
     }
 }
@@ -169,17 +170,17 @@ pub(super) fn pack(kernel: KernelId, weights: &[i8], groups: u16, outputs: u16, 
 }
 
 /// `R(v, n)`.
-pub(super) fn round(value: i128, shift: u32) -> i128 {
+pub(in crate::kernels) fn round(value: i128, shift: u32) -> i128 {
     if shift == 0 { value } else { (value + (1 << (shift - 1))).div_euclid(1 << shift) }
 }
 
 /// `min(max(v, min), max)`.
-pub(super) fn clamp(value: i128, clamp: Clamp) -> i128 {
+pub(in crate::kernels) fn clamp(value: i128, clamp: Clamp) -> i128 {
     value.max(clamp.min.into()).min(clamp.max.into())
 }
 
 /// The epilogue of a weighted step; `residual` is the code that a residual operand holds there.
-pub(super) fn rescale(args: &RescaleArgs<'_>, channel: usize, acc: i128, residual: i128) -> i128 {
+pub(in crate::kernels) fn rescale(args: &RescaleArgs<'_>, channel: usize, acc: i128, residual: i128) -> i128 {
     let t = round(acc, args.pre_shift) * i128::from(args.multipliers[channel]);
     let n = u32::from(args.shifts[channel]);
     let value = match args.residual {
@@ -194,7 +195,7 @@ pub(super) fn rescale(args: &RescaleArgs<'_>, channel: usize, acc: i128, residua
 }
 
 /// Random constants of a [`RescaleArgs`] for sums of about `bits` digits.
-pub(super) struct RescaleConstants {
+pub(in crate::kernels) struct RescaleConstants {
     pub bias: Vec<i32>,
     pub multipliers: Vec<i32>,
     pub shifts: Vec<u8>,
@@ -210,14 +211,14 @@ pub(super) struct RescaleConstants {
 
 /// Second term of a random epilogue.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) enum ResidualKind {
+pub(in crate::kernels) enum ResidualKind {
     None,
     Scaled { in_place: bool },
     Stream { in_place: bool },
 }
 
 impl RescaleConstants {
-    pub(super) fn random(rng: &mut Rng, channels: usize, elements: usize, bits: i64) -> Self {
+    pub(in crate::kernels) fn random(rng: &mut Rng, channels: usize, elements: usize, bits: i64) -> Self {
         let output = rng.element_type();
         let in_place = rng.flag();
         let residual = match rng.next() % 3 {
@@ -245,7 +246,7 @@ impl RescaleConstants {
     }
 
     /// The output buffer before the step: the residual where it is in place, else garbage.
-    pub(super) fn initial_output(&self, rng: &mut Rng) -> Buffer {
+    pub(in crate::kernels) fn initial_output(&self, rng: &mut Rng) -> Buffer {
         match self.residual {
             ResidualKind::Scaled { in_place: true } | ResidualKind::Stream { in_place: true } => {
                 self.residual_buffer.clone()
@@ -254,7 +255,7 @@ impl RescaleConstants {
         }
     }
 
-    pub(super) fn args(&self) -> RescaleArgs<'_> {
+    pub(in crate::kernels) fn args(&self) -> RescaleArgs<'_> {
         let stored = |in_place: bool| (!in_place).then(|| self.residual_buffer.codes());
         RescaleArgs {
             pre_shift: self.pre_shift,
@@ -277,7 +278,7 @@ impl RescaleConstants {
 }
 
 /// An epilogue that no compiler writes.
-pub(super) const HOSTILE: RescaleArgs<'static> = RescaleArgs {
+pub(in crate::kernels) const HOSTILE: RescaleArgs<'static> = RescaleArgs {
     pre_shift: 255,
     bias: &[i32::MIN, i32::MAX],
     multipliers: &[i32::MIN, i32::MAX],
@@ -286,3 +287,41 @@ pub(super) const HOSTILE: RescaleArgs<'static> = RescaleArgs {
     clamp: Clamp { min: i16::MAX, max: i16::MIN },
     residual: ResidualArgs::Scaled { codes: None, zero_point: i16::MIN, multipliers: &[i32::MIN, i32::MIN] },
 };
+
+/// The table of [`crate::fixed_point::exp2_q15`].
+pub(in crate::kernels) fn exp_table() -> [i16; EXP_TABLE_LEN] {
+    core::array::from_fn(|k| f64::min(32767.0, (32768.0 * f64::exp2(-(k as f64) / 256.0)).round()) as i16)
+}
+
+/// `[i0, w1]` of half-pixel centers, as the compiler writes them.
+pub(in crate::kernels) fn half_pixel_lines(size: u16, output: u16, weight_bits: u32) -> Vec<[u16; 2]> {
+    let entry = |d: u16| {
+        let source = ((f64::from(d) + 0.5) * f64::from(size) / f64::from(output) - 0.5).max(0.0);
+        let first = source.floor().min(f64::from(size) - 1.0);
+        let weight = ((source - first) * f64::from(1 << weight_bits) + 0.5).floor();
+        [first as u16, weight as u16]
+    };
+    (0..output).map(entry).collect()
+}
+
+/// A random pool over a small map of up to `channels` channels; `None` where the window does not fit.
+pub(in crate::kernels) fn pool_args(rng: &mut Rng, padded: bool, channels: i64) -> Option<PoolArgs> {
+    let input_shape = Shape::map(rng.range(1, 9) as u16, rng.range(1, 9) as u16, rng.range(1, channels) as u16);
+    let mut byte = |low, high| rng.range(low, high) as u8;
+    let (kernel_h, kernel_w, stride_h, stride_w) = (byte(1, 4), byte(1, 4), byte(1, 3), byte(1, 3));
+    let mut pad = |kernel: u8| if padded { byte(0, i64::from(kernel) - 1) } else { 0 };
+    let window = Window {
+        kernel_h,
+        kernel_w,
+        stride_h,
+        stride_w,
+        pad_top: pad(kernel_h),
+        pad_bottom: pad(kernel_h),
+        pad_left: pad(kernel_w),
+        pad_right: pad(kernel_w),
+        dilation_h: 1,
+        dilation_w: 1,
+    };
+    let (height, width) = window.output_size(input_shape.height, input_shape.width)?;
+    Some(PoolArgs { input_shape, output_shape: Shape::map(height, width, input_shape.channels), window })
+}

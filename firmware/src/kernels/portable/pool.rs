@@ -27,7 +27,7 @@ pub fn max_pool(args: &PoolArgs, input: Option<Codes<'_>>, output: CodesMut<'_>)
 
 fn max_pool_into<T: Code>(args: &PoolArgs, input: Option<&[T]>, output: &mut [T]) {
     let Some(windows) = Windows::new(args, input.map_or(output.len(), <[T]>::len), output.len()) else { return };
-    let channels = windows.channels;
+    let channels = windows.channels();
     for (pixel, window) in windows.iter().enumerate() {
         for first in (0..channels).step_by(BLOCK) {
             let len = BLOCK.min(channels - first);
@@ -66,9 +66,9 @@ pub fn average_pool(args: &PoolArgs, requant: &RequantArgs, input: Codes<'_>, ou
 fn average_pool_into<I: Code, O: Code>(args: &PoolArgs, requant: &RequantArgs, input: &[I], output: &mut [O]) {
     let Some(windows) = Windows::new(args, input.len(), output.len()) else { return };
     let zero_point = i64::from(requant.input_zero_point);
-    for (pixel, window) in output.chunks_exact_mut(windows.channels).zip(windows.iter()) {
+    for (pixel, window) in output.chunks_exact_mut(windows.channels()).zip(windows.iter()) {
         for (channel, code) in pixel.iter_mut().enumerate() {
-            let sum = window.pixels().filter_map(|tap| input.get(tap * windows.channels + channel));
+            let sum = window.pixels().filter_map(|tap| input.get(tap * windows.channels() + channel));
             *code = requant.code(sum.map(|q| value(*q) - zero_point).sum());
         }
     }
@@ -102,7 +102,7 @@ fn global_pool_into<T: Code>(channels: usize, sum: &SumArgs, terms: &[TermArgs<'
 }
 
 /// The windows of a pool in raster order of the output.
-struct Windows {
+pub(in crate::kernels) struct Windows {
     rows: Axis,
     columns: Axis,
     input_width: usize,
@@ -112,7 +112,7 @@ struct Windows {
 }
 
 /// One window: the taps that lie on the map.
-struct PoolWindow<'a> {
+pub(in crate::kernels) struct PoolWindow<'a> {
     windows: &'a Windows,
     y: usize,
     x: usize,
@@ -121,7 +121,7 @@ struct PoolWindow<'a> {
 impl Windows {
     /// `None` where the buffers do not have the lengths of the shapes (the output's may be longer) or there is nothing
     /// to do.
-    fn new(args: &PoolArgs, input_len: usize, output_len: usize) -> Option<Self> {
+    pub(in crate::kernels) fn new(args: &PoolArgs, input_len: usize, output_len: usize) -> Option<Self> {
         let (input, output) = (args.input_shape, args.output_shape);
         let fits = input.elements() == input_len as u64 && output.elements() <= output_len as u64;
         (fits && input.channels == output.channels && input.channels > 0).then(|| Self {
@@ -134,7 +134,13 @@ impl Windows {
         })
     }
 
-    fn iter(&self) -> impl Iterator<Item = PoolWindow<'_>> {
+    /// Channels of the map.
+    pub(in crate::kernels) fn channels(&self) -> usize {
+        self.channels
+    }
+
+    /// All windows.
+    pub(in crate::kernels) fn iter(&self) -> impl Iterator<Item = PoolWindow<'_>> {
         (0..self.output_height)
             .flat_map(move |y| (0..self.output_width).map(move |x| PoolWindow { windows: self, y, x }))
     }
@@ -149,12 +155,19 @@ impl PoolWindow<'_> {
     /// Input pixels that the window covers.
     #[inline]
     fn pixels(&self) -> impl Iterator<Item = usize> {
-        let (width, columns) = (self.windows.input_width, self.windows.columns.taps(self.x));
-        self.windows.rows.taps(self.y).flat_map(move |y| columns.clone().map(move |x| y * width + x))
+        let (rows, columns) = (self.windows.rows.kernel(), self.windows.columns.kernel());
+        (0..rows).flat_map(move |row| (0..columns).filter_map(move |column| self.tap(row, column)))
+    }
+
+    /// Input pixel of one tap; `None` in the padding.
+    #[inline]
+    pub(in crate::kernels) fn tap(&self, row: usize, column: usize) -> Option<usize> {
+        let (y, x) = (self.windows.rows.tap(self.y, row)?, self.windows.columns.tap(self.x, column)?);
+        Some(y * self.windows.input_width + x)
     }
 
     /// Number of taps that lie on the map.
-    fn reads(&self) -> usize {
+    pub(in crate::kernels) fn reads(&self) -> usize {
         self.pixels().count()
     }
 }
@@ -162,7 +175,7 @@ impl PoolWindow<'_> {
 #[cfg(test)]
 mod tests {
     extern crate std;
-    use super::super::oracle::{Buffer, FULL, Rng, clamp, for_seeds, round};
+    use super::super::oracle::{Buffer, FULL, clamp, for_seeds, pool_args, round};
     use super::*;
     use crate::kernels::plan::max_pool_in_place;
     use crate::program::{Clamp, Requant, Window};
@@ -192,32 +205,11 @@ mod tests {
         all
     }
 
-    fn random_args(rng: &mut Rng, padded: bool) -> Option<PoolArgs> {
-        let input_shape = Shape::map(rng.range(1, 9) as u16, rng.range(1, 9) as u16, rng.range(1, 35) as u16);
-        let mut byte = |low, high| rng.range(low, high) as u8;
-        let (kernel_h, kernel_w, stride_h, stride_w) = (byte(1, 4), byte(1, 4), byte(1, 3), byte(1, 3));
-        let mut pad = |kernel: u8| if padded { byte(0, i64::from(kernel) - 1) } else { 0 };
-        let window = Window {
-            kernel_h,
-            kernel_w,
-            stride_h,
-            stride_w,
-            pad_top: pad(kernel_h),
-            pad_bottom: pad(kernel_h),
-            pad_left: pad(kernel_w),
-            pad_right: pad(kernel_w),
-            dilation_h: 1,
-            dilation_w: 1,
-        };
-        let (height, width) = window.output_size(input_shape.height, input_shape.width)?;
-        Some(PoolArgs { input_shape, output_shape: Shape::map(height, width, input_shape.channels), window })
-    }
-
     #[test]
     fn max_pool_takes_the_largest_also_in_place() {
         let in_place = core::cell::Cell::new(0);
         for_seeds(600, |rng| {
-            let Some(args) = random_args(rng, true) else { return };
+            let Some(args) = pool_args(rng, true, 35) else { return };
             let element_type = rng.element_type();
             let mut input = rng.buffer(element_type, args.input_shape.elements() as usize);
             let expected: Vec<i128> = windows(&args, &input).iter().map(|codes| *codes.iter().max().unwrap()).collect();
@@ -258,7 +250,7 @@ mod tests {
     #[test]
     fn average_pool_equals_the_formula() {
         for_seeds(400, |rng| {
-            let Some(args) = random_args(rng, false) else { return };
+            let Some(args) = pool_args(rng, false, 35) else { return };
             let (from, to) = (rng.element_type(), rng.element_type());
             let input = rng.buffer(from, args.input_shape.elements() as usize);
             let bits = |t| if t == ElementType::I8 { 8 } else { 16 };

@@ -80,10 +80,10 @@ fn write_pixel<I: Code, O: Code>(
 }
 
 /// The two input lines that an output line reads, each with its weight.
-struct Neighbors([(usize, i64); 2]);
+pub(in crate::kernels) struct Neighbors(pub(in crate::kernels) [(usize, i64); 2]);
 
 impl Neighbors {
-    fn new([first, weight]: [u16; 2], size: u16, weight_bits: u32) -> Self {
+    pub(in crate::kernels) fn new([first, weight]: [u16; 2], size: u16, weight_bits: u32) -> Self {
         let second = first.saturating_add(1).min(size.saturating_sub(1));
         let (one, weight) = (1 << weight_bits.min(31), i64::from(weight));
         Self([(usize::from(first), one - weight), (usize::from(second), weight)])
@@ -99,23 +99,12 @@ impl Neighbors {
 #[cfg(test)]
 mod tests {
     extern crate std;
-    use super::super::oracle::{Buffer, clamp, for_seeds, round};
+    use super::super::oracle::{Buffer, clamp, for_seeds, half_pixel_lines, round};
     use super::*;
     use crate::kernels::SumArgs;
     use crate::program::Clamp;
     use crate::tensor::{ElementType, Shape};
     use std::vec::Vec;
-
-    /// `[i0, w1]` of half-pixel centers, as the compiler writes them.
-    fn axis(size: u16, output: u16, weight_bits: u32) -> Vec<[u16; 2]> {
-        let entry = |d: u16| {
-            let source = ((f64::from(d) + 0.5) * f64::from(size) / f64::from(output) - 0.5).max(0.0);
-            let first = source.floor().min(f64::from(size) - 1.0);
-            let weight = ((source - first) * f64::from(1 << weight_bits) + 0.5).floor();
-            [first as u16, weight as u16]
-        };
-        (0..output).map(entry).collect()
-    }
 
     fn expected(args: &ResizeArgs<'_>, input: &Buffer, residual: &Buffer) -> Vec<i128> {
         let (i, o, one) = (args.input_shape, args.output_shape, 1i128 << args.weight_bits);
@@ -154,8 +143,8 @@ mod tests {
             let in_place = rng.flag();
             let residual_type = if in_place { to } else { rng.element_type() };
             let residual = rng.buffer(residual_type, output_shape.elements() as usize);
-            let rows = axis(input_shape.height, output_shape.height, weight_bits);
-            let columns = axis(input_shape.width, output_shape.width, weight_bits);
+            let rows = half_pixel_lines(input_shape.height, output_shape.height, weight_bits);
+            let columns = half_pixel_lines(input_shape.width, output_shape.width, weight_bits);
             let second = TermArgs {
                 codes: (!in_place).then(|| residual.codes()),
                 zero_point: rng.zero_point(residual_type),

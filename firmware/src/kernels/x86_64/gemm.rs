@@ -7,7 +7,8 @@
 
 use super::super::k4n16::{OUTPUTS, Packed, QUAD, block_bytes};
 use super::super::plan::{PACKED_TILE_ROWS, row_stride_bytes};
-use super::super::portable::{Code, Windows, take};
+use super::super::portable::Windows;
+use super::super::portable::codes::{Code, take};
 use super::super::{Conv2dArgs, LinearArgs, RescaleArgs};
 use crate::tensor::{CodesMut, index};
 use bytemuck::{AnyBitPattern, NoUninit};

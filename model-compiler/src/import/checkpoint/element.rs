@@ -88,7 +88,7 @@ impl TensorData {
 }
 
 /// Converts little-endian elements; `bytes` holds a whole number of them.
-pub(super) fn decode(dtype: DType, bytes: &[u8]) -> TensorData {
+pub(in crate::import) fn decode(dtype: DType, bytes: &[u8]) -> TensorData {
     match dtype {
         DType::F64 => floats(bytes, |element| f64::from_le_bytes(element) as f32),
         DType::F32 => floats(bytes, f32::from_le_bytes),

@@ -3,7 +3,9 @@
 use super::weights::{Problems, oihw_to_ohwi};
 use crate::error::{Error, ErrorCode, Result};
 use crate::import::{ImportOptions, NamedTensors, System};
-use crate::ir::{BatchNorm, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Shape, ValueId, Weights};
+use crate::ir::{
+    BatchNorm, Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Shape, ValueId, Weights,
+};
 use firmware::program::Window;
 use std::sync::Arc;
 
@@ -85,7 +87,7 @@ impl<'a> Builder<'a> {
             window,
             groups: 1,
             normalization: None,
-            relu: false,
+            clip: Clip::NONE,
         };
         let map = self.push(conv, Op::Conv2d(op), &[input])?;
         let mut vector = |leaf: &str| self.vector(&format!("{norm}.{leaf}"), &shape[..1]);
@@ -104,7 +106,7 @@ impl<'a> Builder<'a> {
         let inputs = usize::from(self.graph.value(input).shape.channels);
         let weights = self.weights(&format!("{module}.weight"), &[outputs, inputs]);
         let bias = Some(self.vector(&format!("{module}.bias"), &[outputs]));
-        self.push(module, Op::Linear(Linear { weights, bias, relu: false }), &[input])
+        self.push(module, Op::Linear(Linear { weights, bias, clip: Clip::NONE }), &[input])
     }
 
     /// Weight and bias of a LayerNorm, for rows `first_row ..` as a map of `grid`.

@@ -4,7 +4,7 @@ use super::builder::Builder;
 use super::detect::{indexed_count, most_common};
 use crate::error::Result;
 use crate::import::NamedTensors;
-use crate::ir::{InputKind, Op, Shape, ValueId, WaypointDecoder};
+use crate::ir::{Clip, InputKind, Op, Shape, ValueId, WaypointDecoder};
 
 /// Waypoints to emit; no tensor tells it.
 const STEPS: u16 = 4;
@@ -41,7 +41,7 @@ fn join(b: &mut Builder<'_>, features: ValueId) -> Result<ValueId> {
     let mut x = features;
     for (layer, width) in join_widths(&b.tensors).into_iter().enumerate() {
         x = b.linear(&format!("join.{}", 2 * layer), x, width)?;
-        x = b.push(format!("join.{}", 2 * layer + 1), Op::Relu, &[x])?;
+        x = b.push(format!("join.{}", 2 * layer + 1), Op::Clip(Clip::RELU), &[x])?;
     }
     Ok(x)
 }

@@ -4,7 +4,7 @@ use super::builder::Builder;
 use super::detect::{common_length, indexed_count};
 use crate::error::Result;
 use crate::import::NamedTensors;
-use crate::ir::{Op, ValueId};
+use crate::ir::{Clip, Op, ValueId};
 use firmware::program::Window;
 
 /// Channels the LiDAR histogram has in the published networks: below and above the height threshold.
@@ -48,7 +48,7 @@ impl ResNet {
         let p = &self.prefix;
         let shape = [self.stem, channels, 7, 7];
         let map = b.conv_bn(&format!("{p}.conv1"), &format!("{p}.bn1"), input, shape, Window::square(7, 2, 3))?;
-        let map = b.push(format!("{p}.relu"), Op::Relu, &[map])?;
+        let map = b.push(format!("{p}.relu"), Op::Clip(Clip::RELU), &[map])?;
         b.push(format!("{p}.maxpool"), Op::MaxPool(Window::square(3, 2, 1)), &[map])
     }
 
@@ -67,7 +67,7 @@ impl ResNet {
         let name = |leaf: &str| format!("{module}.{leaf}");
         let shape = [width, channels, 3, 3];
         let map = b.conv_bn(&name("conv1"), &name("bn1"), input, shape, Window::square(3, stride, 1))?;
-        let map = b.push(name("relu"), Op::Relu, &[map])?;
+        let map = b.push(name("relu"), Op::Clip(Clip::RELU), &[map])?;
         let map = b.conv_bn(&name("conv2"), &name("bn2"), map, [width, width, 3, 3], Window::square(3, 1, 1))?;
         let skip = if stride == 1 && channels == width {
             input
@@ -75,7 +75,7 @@ impl ResNet {
             let shape = [width, channels, 1, 1];
             b.conv_bn(&name("downsample.0"), &name("downsample.1"), input, shape, Window::square(1, stride, 0))?
         };
-        let sum = b.push(name("add"), Op::Add { relu: false }, &[map, skip])?;
-        b.push(module, Op::Relu, &[sum])
+        let sum = b.push(name("add"), Op::Add { clip: Clip::NONE }, &[map, skip])?;
+        b.push(module, Op::Clip(Clip::RELU), &[sum])
     }
 }

@@ -4,8 +4,11 @@ use super::builder::Builder;
 use super::detect::{common_length, indexed_count, most_common};
 use crate::error::Result;
 use crate::import::NamedTensors;
-use crate::ir::{LayerNorm, Op, Tokens, ValueId, Weights};
+use crate::ir::{Clip, LayerNorm, Op, Tokens, ValueId, Weights};
 use std::sync::Arc;
+
+/// As published.
+const DEFAULT_HEADS: u16 = 4;
 
 pub(super) struct Transformer {
     scale: usize,
@@ -95,18 +98,18 @@ impl Transformer {
         let query = b.linear(&name("attn.query"), x, self.channels)?;
         let key = b.linear(&name("attn.key"), x, self.channels)?;
         let value = b.linear(&name("attn.value"), x, self.channels)?;
-        let attention = Op::Attention { heads: b.options.heads };
+        let attention = Op::Attention { heads: b.options.heads.unwrap_or(DEFAULT_HEADS) };
         let context = b.push(name("attn.context"), attention, &[query, key, value]);
         let context = context.map_err(|e| e.with_help("--heads sets the number of heads"))?;
         let branch = b.linear(&name("attn.proj"), context, self.channels)?;
-        let stream = b.push(name("attn.add"), Op::Add { relu: false }, &[branch, stream])?;
+        let stream = b.push(name("attn.add"), Op::Add { clip: Clip::NONE }, &[branch, stream])?;
 
         let norm = b.layer_norm(&name("ln2"), self.channels, rows);
         let x = b.push(name("ln2"), Op::LayerNorm(norm), &[stream])?;
         let x = b.linear(&name("mlp.0"), x, self.hidden)?;
-        let x = b.push(name("mlp.1"), Op::Relu, &[x])?;
+        let x = b.push(name("mlp.1"), Op::Clip(Clip::RELU), &[x])?;
         let branch = b.linear(&name("mlp.2"), x, self.channels)?;
-        b.push(module, Op::Add { relu: false }, &[branch, stream])
+        b.push(module, Op::Add { clip: Clip::NONE }, &[branch, stream])
     }
 
     /// Final LayerNorm of one map's tokens, enlarged to the map's size and added to it.
@@ -125,6 +128,6 @@ impl Transformer {
         if factor != (1, 1) {
             branch = b.push(format!("{p}.upsample.{side}"), Op::ResizeBilinear { factor }, &[branch])?;
         }
-        b.push(format!("{p}.add.{side}"), Op::Add { relu: false }, &[branch, map])
+        b.push(format!("{p}.add.{side}"), Op::Add { clip: Clip::NONE }, &[branch, map])
     }
 }

@@ -83,7 +83,7 @@ fn defect(name: &str, values: &[f32], shape: &[usize]) -> Option<String> {
 }
 
 /// `[O][I][kh][kw]` of the framework to `[O][kh][kw][I]` of the graph.
-pub(super) fn oihw_to_ohwi(values: &[f32], [o, i, kh, kw]: [usize; 4]) -> Arc<Weights> {
+pub(in crate::import) fn oihw_to_ohwi(values: &[f32], [o, i, kh, kw]: [usize; 4]) -> Arc<Weights> {
     let taps = kh * kw;
     let mut data = Vec::with_capacity(values.len());
     if i * taps > 0 {

@@ -3,12 +3,10 @@
 //!
 //! `vpmaddubsw` on codes + 128 would take half the instructions, but saturates: 2·255·127 > 2^15.
 
-#![allow(unsafe_code, reason = "instructions beyond the target's own, and their loads and stores")]
-
 use super::epilogue::Epilogue;
 use super::{BLOCKS, CHANNELS, Operands, ROWS, Sums, Tile};
 use crate::kernels::k4n16::{COMPENSATION_BYTES, QUAD, QUAD_BYTES};
-use crate::kernels::portable::Code;
+use crate::kernels::portable::codes::Code;
 use crate::kernels::x86_64::Avx2;
 use core::arch::x86_64::{
     __m256i, _mm_loadu_si128, _mm256_add_epi32, _mm256_cvtepi8_epi16, _mm256_hadd_epi32, _mm256_madd_epi16,

@@ -1,12 +1,10 @@
 //! The tile for AVX-512 VNNI: `vpdpbusd` multiplies unsigned codes (raised by 128) with signed weights, four depth
 //! elements of 16 output channels at once, and adds exactly; the packed compensation takes the 128 out again.
 
-#![allow(unsafe_code, reason = "instructions beyond the target's own, and their loads and stores")]
-
 use super::epilogue::Epilogue;
 use super::{BLOCKS, CHANNELS, Operands, ROWS, Sums, Tile};
 use crate::kernels::k4n16::{COMPENSATION_BYTES, OUTPUTS, QUAD, QUAD_BYTES};
-use crate::kernels::portable::Code;
+use crate::kernels::portable::codes::Code;
 use crate::kernels::x86_64::Avx512Vnni;
 use core::arch::x86_64::{
     _mm512_dpbusd_epi32, _mm512_loadu_si512, _mm512_set1_epi32, _mm512_setzero_si512, _mm512_storeu_si512,

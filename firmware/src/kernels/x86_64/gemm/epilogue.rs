@@ -7,7 +7,7 @@
 use super::CHANNELS;
 use crate::fixed_point::clamp_code;
 use crate::kernels::k4n16::OUTPUTS;
-use crate::kernels::portable::{Code, operand_len};
+use crate::kernels::portable::codes::{Code, operand_len};
 use crate::kernels::{RescaleArgs, ResidualArgs};
 use crate::tensor::Codes;
 use core::ops::Range;

@@ -1,0 +1,49 @@
+//! What `--help` shows at its end. A line that begins with two blanks is a command that works as it stands.
+
+pub const ALL: &str =
+    "Without a command: the demo. It compiles the bundled network (small and untrained), runs it, verifies every
+byte, and writes image, record and report.
+
+Examples:
+  host-sim
+  host-sim run transfuser.img --frames frames/
+  host-sim verify transfuser.img --model transfuser.pth --frames drive/ --mirror --min-sqnr 20
+  host-sim bench transfuser.img
+  host-sim ablate transfuser.pth --calib frames/ --frames drive/
+  host-sim completions bash";
+
+pub const RUN: &str = "Examples:
+  host-sim run transfuser.img --frames frames/
+  host-sim run transfuser.img --frames frames/ --backend portable
+  host-sim run transfuser.pth --inputs inputs.safetensors --json";
+
+pub const VERIFY: &str = "Examples:
+  host-sim verify transfuser.img --inputs inputs.safetensors
+  host-sim verify transfuser.img --model transfuser.pth --frames drive/
+  host-sim verify transfuser.img --model transfuser.pth --frames drive/ --mirror --min-sqnr 20
+  host-sim verify transfuser.img --record build/transfuser.record --frames drive/ --json
+  host-sim verify transfuser.img --model transfuser.pth --frames frames/ --report out/ --gate gates.toml
+  host-sim verify resnet20.img --model resnet20.onnx --frames images/ --min-agreement 98";
+
+pub const DIFF: &str = "Examples:
+  host-sim diff old/report.json new/report.json
+  host-sim diff old/report.json new/report.json --max-loss 1 --report out/";
+
+pub const SCHEMA: &str = "Examples:
+  host-sim schema";
+
+pub const ABLATE: &str = "Examples:
+  host-sim ablate transfuser.pth --calib frames/ --frames drive/
+  host-sim ablate transfuser.pth --calib inputs.safetensors --inputs inputs.safetensors --mirror --json";
+
+pub const BENCH: &str = "Examples:
+  host-sim bench transfuser.img
+  host-sim bench transfuser.img --backend portable --backend avx2 --rounds 50
+  host-sim bench transfuser.img --all
+  host-sim bench transfuser.img --json";
+
+pub const COMPLETIONS: &str = "In bash: `source <(host-sim completions bash)`, now or in ~/.bashrc.
+
+Examples:
+  host-sim completions bash
+  host-sim completions zsh";
