@@ -112,15 +112,15 @@ impl Packer {
         Ok(Some(id))
     }
 
-    /// Weights of `groups` groups of `outputs` output channels each, in a kernel's order.
+    /// Weights of `outputs` output channels in `groups` groups, in a kernel's order.
     fn weights(&mut self, kernel: KernelId, groups: u16, outputs: u16, weights: &[i8]) -> Result<ConstRange> {
         match kernel {
             KernelId::Direct => self.constants.push(weights),
             KernelId::K4N16 => {
-                let depth = weights.len() / (usize::from(groups) * usize::from(outputs)).max(1);
+                let depth = weights.len() / usize::from(outputs).max(1);
                 let bytes = plan::weight_bytes(kernel, groups, outputs, depth as u64);
                 let mut packed = vec![0; narrow(bytes, "weight bytes")?];
-                k4n16::pack(weights, outputs, depth, &mut packed);
+                k4n16::pack(weights, outputs / groups.max(1), depth, &mut packed);
                 self.constants.push(&packed)
             }
         }
@@ -155,7 +155,7 @@ impl Packer {
                 window: *window,
                 groups: *groups,
                 kernel,
-                weights: self.weights(kernel, *groups, channels(output) / (*groups).max(1), weights)?,
+                weights: self.weights(kernel, *groups, channels(output), weights)?,
                 padding_codes: self.constants.push(padding_codes)?,
                 rescale: self.rescale(rescale)?,
                 scratch,

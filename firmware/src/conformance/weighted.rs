@@ -102,8 +102,7 @@ fn packed<'m>(draw: &mut Draw<'m>, kernel: KernelId, groups: u16, outputs: u16, 
     match kernel {
         KernelId::Direct => Some(weights),
         KernelId::K4N16 => {
-            let packed =
-                draw.take::<i8>(usize::try_from(plan::weight_bytes(kernel, groups, outputs, depth as u64)).ok()?)?;
+            let packed = draw.take::<i8>(usize::try_from(k4n16::packed_bytes(groups, outputs, depth as u64)).ok()?)?;
             packed.fill(0);
             k4n16::pack(weights, outputs, depth, packed);
             Some(packed)

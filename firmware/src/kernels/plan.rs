@@ -25,11 +25,12 @@ pub const fn suits(kernel: KernelId, groups: u16, outputs: u16) -> bool {
     }
 }
 
-/// Bytes of packed weights: `groups` groups of `outputs` outputs with `depth` weights each.
+/// Bytes of packed weights: `outputs` output channels in `groups` groups, with `depth` weights each.
 pub const fn weight_bytes(kernel: KernelId, groups: u16, outputs: u16, depth: u64) -> u64 {
     match kernel {
-        KernelId::Direct => (groups as u64 * outputs as u64).saturating_mul(depth),
-        KernelId::K4N16 => k4n16::packed_bytes(groups, outputs, depth),
+        KernelId::Direct => (outputs as u64).saturating_mul(depth),
+        KernelId::K4N16 if groups == 0 => 0,
+        KernelId::K4N16 => k4n16::packed_bytes(groups, outputs / groups, depth),
     }
 }
 
@@ -192,8 +193,8 @@ mod tests {
         assert!(suits(KernelId::K4N16, 1, 3) && suits(KernelId::K4N16, 2, 64));
         assert!(!suits(KernelId::K4N16, 2, 48) && !suits(KernelId::K4N16, 64, 64) && !suits(KernelId::K4N16, 0, 64));
         assert!(suits(KernelId::Direct, 64, 64));
-        assert_eq!(weight_bytes(KernelId::Direct, 2, 8, 9), 144);
-        assert_eq!(weight_bytes(KernelId::K4N16, 2, 17, 9), 4 * (64 + 16 * 64));
+        assert_eq!(weight_bytes(KernelId::Direct, 2, 16, 9), 144);
+        assert_eq!(weight_bytes(KernelId::K4N16, 2, 34, 9), 4 * (64 + 16 * 64));
     }
 
     #[test]

@@ -16,8 +16,7 @@ pub(super) fn validate(step: &Conv2d, context: &StepContext<'_, '_>) -> Result<u
     context.ensure(Check::StepGroups, divides(input.channels) && divides(output.channels), step.groups, 1)?;
     let taps = u64::from(step.window.kernel_h).saturating_mul(step.window.kernel_w.into());
     let depth = taps.saturating_mul(input.channels.checked_div(step.groups).unwrap_or_default().into());
-    let outputs_per_group = output.channels.checked_div(step.groups).unwrap_or_default();
-    let weights = plan::weight_bytes(step.kernel, step.groups, outputs_per_group, depth);
+    let weights = plan::weight_bytes(step.kernel, step.groups, output.channels, depth);
     context.constants::<i8>(step.weights, weights)?;
     context.constants::<i8>(step.padding_codes, input.channels.into())?;
     rescale::validate(&step.rescale, step.output, context)?;

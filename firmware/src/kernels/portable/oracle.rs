@@ -4,7 +4,7 @@
 extern crate std;
 
 use crate::fixed_point::EXP_TABLE_LEN;
-use crate::kernels::{PoolArgs, RescaleArgs, ResidualArgs, k4n16, plan};
+use crate::kernels::{PoolArgs, RescaleArgs, ResidualArgs, k4n16};
 use crate::program::{Clamp, KernelId, Requant, Window};
 use crate::tensor::{Codes, CodesMut, ElementType, Shape};
 use std::vec::Vec;
@@ -164,7 +164,7 @@ pub(super) fn pack(kernel: KernelId, weights: &[i8], groups: u16, outputs: u16, 
     if kernel == KernelId::Direct {
         return weights.to_vec();
     }
-    let mut packed = std::vec![0; plan::weight_bytes(kernel, groups, outputs, depth as u64) as usize];
+    let mut packed = std::vec![0; k4n16::packed_bytes(groups, outputs, depth as u64) as usize];
     k4n16::pack(weights, outputs, depth, &mut packed);
     packed
 }
