@@ -8,7 +8,7 @@ use tests::project::Project;
 #[test]
 fn verify_catches_an_engine_with_a_fault() {
     let project = Project::new(System::TransFuser);
-    let command = "verify net.img --inputs inputs.safetensors --backend portable";
+    let command = "verify net.img --inputs inputs.safetensors";
     assert_eq!(project.host_sim(command).status, 0);
     let cases = [
         ("DepthTail", "conv2d"),
@@ -25,6 +25,9 @@ fn verify_catches_an_engine_with_a_fault() {
         let position = report["first_difference"]["position"].as_u64().unwrap() as usize;
         assert_eq!(report["steps"][position]["op"], op, "{fault} shows first where it acts");
     }
+    let vectors = project.host_sim(&format!("{command} --backend avx2 --fault DepthTail"));
+    assert_eq!(vectors.status, 2);
+    assert!(vectors.err.contains("--fault: the kernels of avx2 hold no faults"), "{}", vectors.err);
     let unknown = project.host_sim(&format!("{command} --fault Gremlins"));
     assert_eq!(unknown.status, 2);
     assert!(

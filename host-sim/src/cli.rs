@@ -237,8 +237,16 @@ impl BenchArgs {
 }
 
 impl BackendArgs {
-    fn choose(&self) -> Result<Backend> {
-        Backend::choose(self.backend)
+    /// The backend asked for, else the fastest; with a fault the portable one, which alone has faults in its kernels.
+    fn choose(&self, common: &Common) -> Result<Backend> {
+        match self.backend {
+            _ if !common.has_fault() => Backend::choose(self.backend),
+            None | Some(BackendKind::Portable) => Backend::choose(Some(BackendKind::Portable)),
+            Some(kind) => {
+                let message = format!("the kernels of {} hold no faults", kind.name());
+                Err(Error::new(ErrorCode::Usage, "--fault", message).with_help("use --backend portable"))
+            }
+        }
     }
 }
 
@@ -247,7 +255,7 @@ struct Common {
     /// Machine-readable result on stdout, errors too.
     #[arg(long)]
     json: bool,
-    /// Runs the engine with a named fault, to show that the comparison can fail (kernels: `--backend portable` only).
+    /// Runs the engine with a named fault, to show that the comparison can fail; on the portable backend.
     #[cfg(feature = "fault-injection")]
     #[arg(long, value_name = "NAME")]
     fault: Option<String>,
@@ -316,7 +324,7 @@ impl Command {
     fn execute(self, console: &mut Console<'_>, progress: &ProgressBar) -> Result<u8> {
         match self {
             Self::Run { model, import, frames, backend, common } => {
-                let report = run::run(&model, &import.options()?, &frames, backend.choose()?, progress)?;
+                let report = run::run(&model, &import.options()?, &frames, backend.choose(&common)?, progress)?;
                 progress.finish_and_clear();
                 console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(0)
@@ -337,7 +345,7 @@ impl Command {
             } => {
                 let noise = noise_share
                     .map_or(Selection::WhereCheap, |count| Selection::Lowest(count.unwrap_or(noise::DEFAULT_TENSORS)));
-                let (import, backend, gates) = (import.options()?, backend.choose()?, gates.gates()?);
+                let (import, backend, gates) = (import.options()?, backend.choose(&common)?, gates.gates()?);
                 let options =
                     verify::Options { image, record, model, import, frames, backend, mirror, gates, baseline, noise };
                 let verified = verify::verify(&options, progress)?;
@@ -414,6 +422,16 @@ fn compare(
 }
 
 impl Common {
+    #[cfg(feature = "fault-injection")]
+    fn has_fault(&self) -> bool {
+        self.fault.is_some()
+    }
+
+    #[cfg(not(feature = "fault-injection"))]
+    fn has_fault(&self) -> bool {
+        false
+    }
+
     #[cfg(feature = "fault-injection")]
     fn inject_fault(&self) -> Result<()> {
         use firmware::fault::{self, Fault};

@@ -208,6 +208,15 @@ impl Builder<'_> {
             }
             Op::Conv2d(conv) => self.conv2d(node, conv),
             Op::Linear(linear) => self.linear(node, linear),
+            Op::MaxPool(window) | Op::AveragePool(window) if [window.dilation_h, window.dilation_w] != [1, 1] => {
+                let message = format!(
+                    "{} of dilation {}×{} has no integer form",
+                    node.op.name(),
+                    window.dilation_h,
+                    window.dilation_w
+                );
+                Err(Error::new(ErrorCode::Unsupported, "", message).with_help("use a pool of dilation 1"))
+            }
             Op::MaxPool(window) => {
                 let (input, output) = (self.tensor(node.inputs[0]), self.tensor(node.output));
                 self.step(node, QOp::MaxPool { input, output, window: *window }, Bounds::default());

@@ -34,6 +34,19 @@ fn quantized(graph: &mut Graph, output: ValueId) -> Result<QModel> {
     quantize(graph, &frames, &statistics, &QuantizeOptions::default(), |_, _| ())
 }
 
+#[test]
+fn a_dilated_pool_is_refused_by_name() {
+    let (mut graph, rgb) = image(Shape::map(6, 6, 3));
+    let x = conv(&mut graph, "x", rgb, 0.0);
+    let window = Window { dilation_h: 2, dilation_w: 2, ..Window::square(2, 1, 0) };
+    let pool = graph.push("pool", Op::MaxPool(window), &[x]).unwrap();
+    let error = quantized(&mut graph, pool).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "node pool: max_pool of dilation 2×2 has no integer form\n  help: use a pool of dilation 1"
+    );
+}
+
 fn names(model: &QModel) -> Vec<(&str, &str)> {
     model.steps.iter().map(|step| (step.name.as_str(), step.op.name())).collect()
 }
