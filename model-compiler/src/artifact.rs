@@ -10,7 +10,8 @@ use std::path::Path;
 use tempfile::NamedTempFile;
 
 const HEADER_BYTES: usize = 48;
-const FORMAT: u32 = 1;
+/// Rises whenever a stored structure changes.
+const FORMAT: u32 = 2;
 
 /// A kind of sealed file.
 pub trait Artifact: Serialize + DeserializeOwned {
