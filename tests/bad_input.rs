@@ -417,7 +417,7 @@ fn quantized_models_and_records_that_are_damaged() {
         refused(&folder, compile, &damaged);
         refused(&folder, "model-compiler inspect @bad.qmodel", &damaged);
     }
-    folder.write("bad.qmodel", changed(8, 1 ^ 9));
+    folder.write("bad.qmodel", changed(8, 2 ^ 9));
     refused(&folder, compile, &format!("@bad.qmodel: format of the quantized model: found 9, expected 2\n  {help}"));
     folder.write("bad.qmodel", &qmodel[..5]);
     refused(
