@@ -29,14 +29,6 @@
 //! assert_eq!(input, [127; 48]);
 //! ```
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::InputSize;
 use crate::tensor::Shape;
 use core::fmt;

@@ -9,14 +9,6 @@
 //! The trained network depends on how its authors looked at a point, so this is kept as it was: the height of a point is
 //! ignored, left is taken for right in the image, and cells on the ground are ±16 m × 32 m, counted from the sensor.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::lidar::Point;
 use super::{InputSize, NotFinite};
 use fixed::types::I16F16;

@@ -1,13 +1,5 @@
 //! An `f32`, given as its bits, to fixed point without float arithmetic.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::NotFinite;
 use crate::fixed_point::saturate_i32;
 use fixed::types::I16F16;

@@ -4,14 +4,6 @@
 //! pixels of a *map* of 256×256 (5.5 pixels per meter, the vehicle at the middle of the lower edge), drawn onto the
 //! camera image of 256×144 and clamped to it; it is not where the goal appears in the camera.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::InputSize;
 use crate::tensor::Shape;
 

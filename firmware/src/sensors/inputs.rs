@@ -1,13 +1,5 @@
 //! Speed, goal and command to the codes of their inputs: to the nearest, ties up, saturating.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::{NotFinite, float::round_scaled};
 use crate::fixed_point::{saturate_i16, saturate_i32};
 use core::fmt;

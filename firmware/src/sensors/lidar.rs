@@ -1,13 +1,5 @@
 //! LiDAR points in the frame that the networks were trained with.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::{NotFinite, float::odd_q16};
 use fixed::types::I16F16;
 

@@ -1,13 +1,5 @@
 //! The order of several cameras.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 /// A camera by where it looks, in the order in which networks read them. TransFuser and AIM read the first view or
 /// all; LBC reads the first three, interleaved into one map.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]

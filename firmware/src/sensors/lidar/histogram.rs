@@ -4,14 +4,6 @@
 //! the sensor (last column). Numbers of bins are powers of two; the published networks have 256 × 256 bins of
 //! 65/256 m × 0.125 m. Bins are half-open, the last one of each axis is closed, and points outside are left out.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::Point;
 use crate::sensors::{InputSize, NotFinite};
 use crate::tensor::{Shape, index};

@@ -1,13 +1,5 @@
 //! Motion of the vehicle between the capture of a point and now.
 
-#![deny(
-    clippy::indexing_slicing,
-    clippy::arithmetic_side_effects,
-    clippy::unwrap_used,
-    clippy::expect_used,
-    clippy::panic
-)]
-
 use super::Point;
 use crate::fixed_point::{round_shift, saturate_i32};
 use core::fmt;
