@@ -97,3 +97,77 @@ impl Controller {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn point(right: f64, forward: f64) -> Point {
+        Point { right: Real::from_num(right), forward: Real::from_num(forward) }
+    }
+
+    /// Of a fresh controller; the second waypoint is as far behind the first as the first behind the vehicle.
+    fn first_step(tuning: Tuning, right: f64, forward: f64, speed: f64) -> Controls {
+        let points = [point(right, forward), point(2.0 * right, 2.0 * forward)];
+        Controller::new(tuning).step(points, Real::from_num(speed))
+    }
+
+    fn close(found: Real, expected: f64) -> bool {
+        (found.to_num::<f64>() - expected).abs() < 1e-6
+    }
+
+    #[test]
+    fn straight_ahead_and_too_slow_is_full_throttle() {
+        let controls = first_step(Tuning::BASELINES, 0.0, 2.0, 1.0);
+        assert!(close(controls.steer, 0.0), "{controls:?}");
+        assert_eq!((controls.throttle, controls.brake), (Real::lit("0.75"), Real::ZERO));
+    }
+
+    #[test]
+    fn the_first_step_is_the_sum_of_the_three_gains() {
+        // A tenth of a quarter turn to the right: 1.25 + 0.75/40 + 0.3 times the angle.
+        let (sine, cosine) = (core::f64::consts::FRAC_PI_2 * 0.1).sin_cos();
+        let controls = first_step(Tuning::BASELINES, 2.0 * sine, 2.0 * cosine, 3.98);
+        assert!(close(controls.steer, 0.1 * (1.25 + 0.75 / 40.0 + 0.3)), "{controls:?}");
+        assert!(close(controls.throttle, 0.02 * (5.0 + 0.5 / 40.0 + 1.0)), "{controls:?}");
+    }
+
+    #[test]
+    fn waypoints_at_rest_brake_at_every_speed() {
+        for speed in [-1.0, 0.0, 0.5, 30.0] {
+            let controls = Controller::new(Tuning::TRANSFUSER).step([point(0.0, 1.0); 2], Real::from_num(speed));
+            assert_eq!((controls.throttle, controls.brake), (Real::ZERO, Real::ONE), "{speed} m/s");
+        }
+    }
+
+    #[test]
+    fn more_than_a_tenth_too_fast_brakes() {
+        for (speed, brake) in [(4.399, Real::ZERO), (4.401, Real::ONE)] {
+            assert_eq!(first_step(Tuning::BASELINES, 0.0, 2.0, speed).brake, brake, "{speed} m/s");
+        }
+    }
+
+    #[test]
+    fn brake_speeds_differ() {
+        // 0.2 m/s: TransFuser rolls, the baselines stop.
+        assert_eq!(first_step(Tuning::TRANSFUSER, 0.0, 0.1, 0.1).brake, Real::ZERO);
+        assert_eq!(first_step(Tuning::BASELINES, 0.0, 0.1, 0.1).brake, Real::ONE);
+    }
+
+    #[test]
+    fn only_transfuser_keeps_its_steering_straight_at_a_stop() {
+        assert_eq!(first_step(Tuning::TRANSFUSER, 1.0, 1.0, 0.009).steer, Real::ZERO);
+        assert_ne!(first_step(Tuning::TRANSFUSER, 1.0, 1.0, 0.011).steer, Real::ZERO);
+        assert_ne!(first_step(Tuning::BASELINES, 1.0, 1.0, 0.0).steer, Real::ZERO);
+    }
+
+    #[test]
+    fn a_plan_that_is_driven_on_steers_to_the_same_side() {
+        let mut controller = Controller::new(Tuning::TRANSFUSER);
+        let points = [point(0.1, 1.0), point(0.2, 2.0)];
+        for step in 0..100 {
+            let controls = controller.step(points, Real::from_num(2));
+            assert!(controls.steer > Real::ZERO && controls.steer < Real::from_num(0.2), "step {step}: {controls:?}");
+        }
+    }
+}

@@ -45,3 +45,34 @@ impl Controls {
         Self { brake, ..self }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pedals(throttle: f64, brake: f64) -> Controls {
+        Controls { throttle: Real::from_num(throttle), brake: Real::from_num(brake), ..Controls::ZERO }
+    }
+
+    #[test]
+    fn a_faint_or_weaker_brake_is_none() {
+        assert_eq!(pedals(0.0, 0.049).exclusive(), pedals(0.0, 0.0));
+        assert_eq!(pedals(0.3, 0.25).exclusive(), pedals(0.3, 0.0));
+        assert_eq!(
+            pedals(0.25, 0.25).exclusive(),
+            pedals(0.25, 0.25),
+            "an equal brake stays, and so does the throttle"
+        );
+        assert_eq!(pedals(0.0, 1.0).exclusive(), pedals(0.0, 1.0));
+    }
+
+    #[test]
+    fn logistic_values_become_controls() {
+        let half = Controls { steer: Real::ZERO, ..pedals(0.375, 0.5) };
+        assert_eq!(Controls::from_logistic([1 << 14; 3]), half);
+        assert_eq!(Controls::from_logistic([0; 3]), Controls { steer: -Real::ONE, ..Controls::ZERO });
+        assert_eq!(Controls::from_logistic([i16::MIN; 3]), Controls { steer: -Real::ONE, ..Controls::ZERO });
+        let most = Controls::from_logistic([i16::MAX; 3]);
+        assert!(most.steer < Real::ONE && most.throttle < Real::lit("0.75") && most.brake < Real::ONE);
+    }
+}

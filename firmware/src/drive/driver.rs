@@ -54,6 +54,11 @@ impl NetworkInputs {
     pub const fn velocity_bytes(&self) -> [u8; 2] {
         self.velocity.to_le_bytes()
     }
+
+    /// The command tensor's byte.
+    pub const fn command_bytes(&self) -> [u8; 1] {
+        [self.command.code()]
+    }
 }
 
 /// What a network gave.
@@ -277,3 +282,13 @@ fn plan(answer: &Answer, limits: &Limits, output: NetworkOutput<'_>) -> Result<P
 fn within(limit: Real, value: Real) -> bool {
     value.unsigned_abs() <= limit.unsigned_abs()
 }
+
+#[cfg(test)]
+#[allow(
+    clippy::unwrap_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects,
+    reason = "what is missing fails the test"
+)]
+mod tests;

@@ -52,3 +52,39 @@ impl Pid {
         proportional.saturating_add(integral).saturating_add(derivative)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GAINS: Gains = Gains { proportional: Real::ONE, integral: Real::ZERO, derivative: Real::ZERO };
+    const INTEGRAL: Gains = Gains { proportional: Real::ZERO, integral: Real::ONE, ..GAINS };
+    const DERIVATIVE: Gains = Gains { proportional: Real::ZERO, derivative: Real::ONE, ..GAINS };
+
+    #[test]
+    fn the_integral_is_the_mean_of_forty_errors() {
+        let mut pid = Pid::new(INTEGRAL);
+        for step in 1..=100 {
+            assert_eq!(pid.step(Real::from(40)), Real::from(step.min(40)), "step {step}");
+        }
+        for step in 1..=40 {
+            assert_eq!(pid.step(Real::ZERO), Real::from(40 - step), "step {step}");
+        }
+    }
+
+    #[test]
+    fn the_derivative_is_the_last_change_and_starts_from_zero() {
+        let mut pid = Pid::new(DERIVATIVE);
+        assert_eq!([3, 5, 5, -1].map(|e| pid.step(Real::from(e))), [3, 2, 0, -6].map(Real::from));
+    }
+
+    #[test]
+    fn a_reset_forgets() {
+        let gains = Gains { derivative: Real::ONE, integral: Real::ONE, ..GAINS };
+        let (mut used, mut fresh) = (Pid::new(gains), Pid::new(gains));
+        used.step(Real::MAX);
+        used.step(Real::MIN);
+        used.reset();
+        assert_eq!(used.step(Real::ONE), fresh.step(Real::ONE));
+    }
+}

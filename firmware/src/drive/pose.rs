@@ -143,13 +143,10 @@ mod tests {
         assert_eq!(codes(40_000.0, 40_000.0), [I16F16::MAX, I16F16::MIN]);
         let farthest = Point { right: Real::MAX, forward: Real::MIN };
         assert_eq!(farthest.goal_codes(), [I16F16::MAX; 2]);
-        assert_eq!([1.0, -1.0, 0.001953125, 200.0, -200.0].map(|v| velocity_code(real(v)).to_bits()), [
-            256,
-            -256,
-            1,
-            i16::MAX,
-            i16::MIN
-        ]);
+        assert_eq!(
+            [1.0, -1.0, 0.001953125, 200.0, -200.0].map(|v| velocity_code(real(v)).to_bits()),
+            [256, -256, 1, i16::MAX, i16::MIN]
+        );
     }
 
     #[test]

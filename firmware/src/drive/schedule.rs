@@ -64,12 +64,10 @@ mod tests {
 
     #[test]
     fn step_0_fills_and_every_step_after_it_runs_the_network() {
-        assert_eq!(turns(Schedule::new(Cadence::EveryStep), 4), [
-            Turn::Fill,
-            Turn::Network,
-            Turn::Network,
-            Turn::Network
-        ]);
+        assert_eq!(
+            turns(Schedule::new(Cadence::EveryStep), 4),
+            [Turn::Fill, Turn::Network, Turn::Network, Turn::Network]
+        );
     }
 
     #[test]

@@ -81,9 +81,8 @@ fn unit_vector(radians: Real) -> (I2F30, I2F30) {
 
 /// `1 − c₁·y·(1 − c₂·y·(1 − …))`.
 fn nested(y: I2F30, factors: [I2F30; 4]) -> I2F30 {
-    let next = |inner: I2F30, &factor: &I2F30| {
-        I2F30::ONE.saturating_sub(y.saturating_mul(factor).saturating_mul(inner))
-    };
+    let next =
+        |inner: I2F30, &factor: &I2F30| I2F30::ONE.saturating_sub(y.saturating_mul(factor).saturating_mul(inner));
     factors.iter().rev().fold(I2F30::ONE, next)
 }
 
