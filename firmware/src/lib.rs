@@ -25,6 +25,7 @@
 //!
 //! # Layers, top first
 //!
+//! * [`drive`]: around the network: route, goal, waypoints to steer, throttle and brake, supervision. Fixed point.
 //! * [`engine`]: `start`, `step`, `infer`, self-test. Owns nothing but a position.
 //! * [`ops`]: one operator per file: what its step must satisfy, and how it becomes a call of a kernel.
 //! * [`arena`]: the operands of a step as disjoint slices of one buffer, by checked means only.
@@ -57,6 +58,7 @@ compile_error!("model images are little-endian and executed in place");
 pub mod arena;
 #[cfg(any(test, feature = "conformance"))]
 pub mod conformance;
+pub mod drive;
 pub mod engine;
 pub mod fault;
 pub mod fixed_point;

@@ -7,7 +7,7 @@ use heapless::Vec;
 pub const MAX_WAYPOINTS: usize = 16;
 
 /// Where to be, half a second after the waypoint before (the first: half a second from now), in the vehicle's frame.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Waypoint {
     /// Meters to the right.
     pub right: I16F16,
