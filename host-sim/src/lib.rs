@@ -32,6 +32,7 @@ pub mod diff;
 pub mod files;
 pub mod gates;
 pub mod histogram;
+pub mod metrics;
 pub mod noise;
 pub mod report;
 pub mod run;
