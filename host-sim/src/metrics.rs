@@ -108,7 +108,8 @@ impl RouteScore {
         let mut ending = Ending::LogEnds;
         let mut end_s = log.ego[0].time_s;
         for (index, state) in log.ego.iter().enumerate() {
-            let step_m = index.checked_sub(1).map_or(0.0, |last| progress::distance(log.ego[last].position_m, state.position_m));
+            let step_m =
+                index.checked_sub(1).map_or(0.0, |last| progress::distance(log.ego[last].position_m, state.position_m));
             driven_m += step_m;
             if state.outside_lanes {
                 outside_m += step_m;
@@ -121,8 +122,7 @@ impl RouteScore {
                 break;
             }
         }
-        let route_completion_percent =
-            if ending == Ending::Completed { 100.0 } else { progress.completion_percent() };
+        let route_completion_percent = if ending == Ending::Completed { 100.0 } else { progress.completion_percent() };
         let (counted, after): (Vec<&Event>, Vec<&Event>) = log.events.iter().partition(|event| event.time_s <= end_s);
         let infractions = Infractions::of(counted);
         let outside_lanes_percent = if driven_m > 0.0 { 100.0 * outside_m / driven_m } else { 0.0 };

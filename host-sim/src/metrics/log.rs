@@ -73,7 +73,8 @@ impl RouteLog {
     pub fn read(path: &Path) -> Result<Self> {
         let bytes = std::fs::read(path).map_err(|e| Error::io(path, &e))?;
         let log: Self = serde_json::from_slice(&bytes).map_err(|e| {
-            let error = Error::new(ErrorCode::Malformed, path.display().to_string(), format!("this is no route log: {e}"));
+            let error =
+                Error::new(ErrorCode::Malformed, path.display().to_string(), format!("this is no route log: {e}"));
             error.with_help("`host-sim schema route-log` prints the format")
         })?;
         log.check().map_err(|e| e.within(path.display()))?;

@@ -6,13 +6,8 @@ use serde::Serialize;
 
 impl EventKind {
     /// Every kind.
-    pub const ALL: [Self; 5] = [
-        Self::CollisionPedestrian,
-        Self::CollisionVehicle,
-        Self::CollisionStatic,
-        Self::RedLight,
-        Self::StopSign,
-    ];
+    pub const ALL: [Self; 5] =
+        [Self::CollisionPedestrian, Self::CollisionVehicle, Self::CollisionStatic, Self::RedLight, Self::StopSign];
 
     /// The factor that each such event puts on the score.
     pub const fn factor(self) -> f64 {
