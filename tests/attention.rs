@@ -130,7 +130,10 @@ fn every_backend_has_the_same_rows() {
     use host_sim::backends::Backend;
     let project = Project::new(System::TransFuser);
     let of = |backend: Backend| {
-        document(&project, &format!("attention net.img --inputs inputs.safetensors --backend {}", backend.kind().name()))
+        document(
+            &project,
+            &format!("attention net.img --inputs inputs.safetensors --backend {}", backend.kind().name()),
+        )
     };
     let documents: Vec<Value> = Backend::all().into_iter().map(of).collect();
     assert!(documents.iter().all(|document| *document == documents[0]));
@@ -180,7 +183,8 @@ fn bad_input_is_exit_status_two_and_says_what_to_do() {
 #[test]
 fn documents_follow_their_schemas() {
     let project = Project::new(System::TransFuser);
-    let schema = |name: &str| -> Value { serde_json::from_str(&project.host_sim(&format!("schema {name}")).out).unwrap() };
+    let schema =
+        |name: &str| -> Value { serde_json::from_str(&project.host_sim(&format!("schema {name}")).out).unwrap() };
     for (name, fields) in [
         ("attention", &["agreement", "frames", "queries"][..]),
         ("score", &["mean", "routes"]),
