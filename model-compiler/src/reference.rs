@@ -21,6 +21,7 @@ mod slice;
 mod tokens;
 mod waypoint_decoder;
 
+pub use attention::attention_weights;
 pub use rerun::{Change, rerun};
 
 #[cfg(test)]
