@@ -64,12 +64,7 @@ pub fn frame(seed: u8) -> Frame {
     Frame {
         name: format!("frame {seed}"),
         rgb: Some(ByteMap { shape: CAMERA, data }),
-        bev: None,
-        velocity: None,
-        goal: None,
-        command: None,
-        dropped_points: 0,
-        label: None,
+        ..Frame::default()
     }
 }
 

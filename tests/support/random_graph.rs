@@ -49,12 +49,7 @@ pub fn frames(graph: &Graph, seed: u64, count: usize) -> Vec<Frame> {
         Frame {
             name: format!("random {i} of seed {seed}"),
             rgb: Some(ByteMap { shape, data }),
-            bev: None,
-            velocity: None,
-            goal: None,
-            command: None,
-            dropped_points: 0,
-            label: None,
+            ..Frame::default()
         }
     };
     (0..count).map(frame).collect()
