@@ -61,11 +61,7 @@ pub fn graph() -> Graph {
 /// A frame whose pixels follow from a seed.
 pub fn frame(seed: u8) -> Frame {
     let data = (0..48_u8).map(|i| i.wrapping_mul(37).wrapping_add(seed.wrapping_mul(91))).collect();
-    Frame {
-        name: format!("frame {seed}"),
-        rgb: Some(ByteMap { shape: CAMERA, data }),
-        ..Frame::default()
-    }
+    Frame { name: format!("frame {seed}"), rgb: Some(ByteMap { shape: CAMERA, data }), ..Frame::default() }
 }
 
 fn qmodel() -> QModel {

@@ -77,8 +77,9 @@ impl FrameFormat {
     /// The same, of a classifier if there is nothing but one image to read and the first output is a vector.
     #[must_use]
     pub fn with_output(mut self, image_name: &str, output: Option<Shape>) -> Self {
-        let reads_only_an_image = self.image.is_some() && self.bev.is_none() && !self.velocity && !self.goal;
-        self.classes = output.filter(|s| reads_only_an_image && (s.height, s.width) == (1, 1)).map(|s| s.channels);
+        let others = self.bev.is_some() || self.velocity || self.goal || self.points.is_some();
+        let is_only_input = self.image.is_some() && !others;
+        self.classes = output.filter(|s| is_only_input && (s.height, s.width) == (1, 1)).map(|s| s.channels);
         if self.classes.is_some() {
             self.image_name = image_name.into();
         }

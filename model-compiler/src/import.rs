@@ -219,8 +219,9 @@ fn unrecognized(tensors: &NamedTensors) -> Error {
     } else {
         format!("the tensor names are of no known system ({} tensors: {}, …)", tensors.len(), first.join(", "))
     };
-    Error::new(ErrorCode::Unsupported, "", message)
-        .with_help("supported are checkpoints of aim, late_fusion, transfuser and geometric_fusion (2021); --system names one")
+    Error::new(ErrorCode::Unsupported, "", message).with_help(
+        "supported are checkpoints of aim, late_fusion, transfuser and geometric_fusion (2021); --system names one",
+    )
 }
 
 #[cfg(test)]

@@ -12,9 +12,9 @@ use crate::qmodel::{
 use firmware::image::TensorRecord;
 use firmware::kernels::{k4n16, plan};
 use firmware::program::{
-    Add, Attention, AveragePool, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GatherSum, GlobalPool, KernelId, LayerNorm,
-    Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, Step, Term, TokenSource, Tokens,
-    WaypointDecoder,
+    Add, Attention, AveragePool, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GatherSum, GlobalPool, KernelId,
+    LayerNorm, Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, Step, Term, TokenSource,
+    Tokens, WaypointDecoder,
 };
 use firmware::tensor::TensorId;
 

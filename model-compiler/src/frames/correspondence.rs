@@ -178,10 +178,12 @@ mod tests {
     #[test]
     fn mirrored_points_give_the_mirrored_lists() {
         // Irrational steps keep the points off the edges of the cells.
-        let points: Vec<Point> =
-            (1..2000).map(|i| [(f64::from(i) * 0.618_034 % 1.0 - 0.5) * 32.0, f64::from(i) * 0.414_214 % 32.0, 0.0]).collect();
+        let points: Vec<Point> = (1..2000)
+            .map(|i| [(f64::from(i) * 0.618_034 % 1.0 - 0.5) * 32.0, f64::from(i) * 0.414_214 % 32.0, 0.0])
+            .collect();
         let [lists, opposite] = [1.0, -1.0].map(|side| {
-            let Correspondence { bev, camera } = correspondence(points.iter().map(|p| [side * p[0], p[1], p[2]]), SHAPE);
+            let Correspondence { bev, camera } =
+                correspondence(points.iter().map(|p| [side * p[0], p[1], p[2]]), SHAPE);
             [bev, camera]
         });
         assert!(lists.iter().all(|map| map.data.iter().filter(|&&v| v != 0).count() > 100));

@@ -236,7 +236,14 @@ mod tests {
         };
         let frame = points(8).unwrap().remove(0);
         let cells = |map: &Option<super::super::ByteMap>| {
-            map.as_ref().unwrap().data.iter().enumerate().filter(|(_, v)| **v != 0).map(|(i, &v)| (i, v)).collect::<Vec<_>>()
+            map.as_ref()
+                .unwrap()
+                .data
+                .iter()
+                .enumerate()
+                .filter(|(_, v)| **v != 0)
+                .map(|(i, &v)| (i, v))
+                .collect::<Vec<_>>()
         };
         // The point lies in LiDAR cell (4, 2) and image cell (4, 5).
         assert_eq!(cells(&frame.bev_points), [(340, 4), (341, 5)]);

@@ -127,9 +127,10 @@ impl<'a> Batch<'a> {
         let view = self.tensor(name, Dtype::I32, &[height, width, pairs, 2])?;
         let number = |(i, &bytes): (usize, &[u8; 4])| {
             let (value, size) = (i32::from_le_bytes(bytes), if i % 2 == 0 { height } else { width });
-            u8::try_from(value).ok().filter(|&cell| usize::from(cell) < size).ok_or_else(|| {
-                tensor_error(name, format!("holds {value}, expected cells 0..={}", size - 1))
-            })
+            u8::try_from(value)
+                .ok()
+                .filter(|&cell| usize::from(cell) < size)
+                .ok_or_else(|| tensor_error(name, format!("holds {value}, expected cells 0..={}", size - 1)))
         };
         let cells: Vec<u8> = view.data().as_chunks::<4>().0.iter().enumerate().map(number).collect::<Result<_>>()?;
         let maps = cells.chunks_exact(height * width * pairs * 2);
@@ -294,11 +295,13 @@ mod tests {
         assert_eq!(frames[0].bev_points.as_ref().unwrap().data, [0, 1, 0, 0, 0, 1, 0, 1]);
         assert_eq!(frames[1].bev_points.as_ref().unwrap().data, [0, 0, 0, 0, 0, 1, 0, 0]);
         assert_eq!(frames[1].raw(InputKind::CameraPoints).unwrap(), [0.0; 8]);
-        for (at, value, expected) in [(3, 2, "holds 2, expected cells 0..=1"), (2, -1, "holds -1, expected cells 0..=0")]
+        for (at, value, expected) in
+            [(3, 2, "holds 2, expected cells 0..=1"), (2, -1, "holds -1, expected cells 0..=0")]
         {
             let mut bad = good;
             bad[at] = value;
-            let message = load_as(&format, &[cells("bev_points", bad), cells("cam_points", good)]).unwrap_err().to_string();
+            let message =
+                load_as(&format, &[cells("bev_points", bad), cells("cam_points", good)]).unwrap_err().to_string();
             assert!(message.contains(&format!("tensor `bev_points`: {expected}")), "{message}");
         }
         let message = load_as(&format, &[cells("bev_points", good)]).unwrap_err().to_string();

@@ -13,7 +13,8 @@ pub(super) fn gather_sum(
     output: QTensorId,
     requantizer: &Requantizer,
 ) -> Result<Vec<f64>> {
-    let (shape, out_shape, index_shape) = (operands.shape(map.tensor)?, operands.shape(output)?, operands.shape(indices)?);
+    let (shape, out_shape, index_shape) =
+        (operands.shape(map.tensor)?, operands.shape(output)?, operands.shape(indices)?);
     expect("output channels", out_shape.channels.into(), shape.channels.into())?;
     expect("rows of indices", index_shape.height.into(), out_shape.height.into())?;
     expect("columns of indices", index_shape.width.into(), out_shape.width.into())?;
@@ -59,10 +60,7 @@ mod tests {
         };
         // Rows of 2 cells of 2 channels: 10 and 11 in cell (0,0), up to 80 and 81 in cell (1,1), less the zero point.
         let map = vec![20.0, 21.0, 40.0, 41.0, 60.0, 61.0, 90.0, 91.0];
-        let operands = [
-            (Shape::map(2, 2, 2), ElementType::I8, map),
-            (indices.0, ElementType::I8, indices.1),
-        ];
+        let operands = [(Shape::map(2, 2, 2), ElementType::I8, map), (indices.0, ElementType::I8, indices.1)];
         execute_alone(op, &operands, (output, ElementType::I8))
     }
 

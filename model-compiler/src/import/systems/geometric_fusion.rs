@@ -130,7 +130,11 @@ impl Side {
         let mut inputs = sizes.embedding;
         let mut projection = Vec::with_capacity(sizes.projection.len());
         for (layer, &outputs) in sizes.projection.iter().enumerate() {
-            projection.push(b.linear_weights(&format!("encoder.{name}_projection{scale}.{}", 2 * layer), inputs, outputs));
+            projection.push(b.linear_weights(
+                &format!("encoder.{name}_projection{scale}.{}", 2 * layer),
+                inputs,
+                outputs,
+            ));
             inputs = outputs;
         }
         Self {
