@@ -290,6 +290,17 @@ pub struct SoftmaxArgs<'a> {
     pub exp_table: &'a [i16],
 }
 
+/// Arguments of [`Kernels::sigmoid`].
+#[derive(Clone, Copy, Debug)]
+pub struct SigmoidArgs<'a> {
+    /// `z`.
+    pub input_zero_point: i16,
+    /// M, n: to Q12.
+    pub requant: Requant,
+    /// 513 entries.
+    pub tanh_table: &'a [i16],
+}
+
 /// One method per operator; see the module page. Operand layouts are those of [`crate::tensor`].
 pub trait Kernels {
     /// The kernels that this backend can read.
@@ -386,6 +397,11 @@ pub trait Kernels {
     fn softmax(&self, args: &SoftmaxArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
         portable::softmax::softmax(args, input, output);
     }
+
+    /// Logistic function of each element. `input` is `None` in place: then `output` holds the codes.
+    fn sigmoid(&self, args: &SigmoidArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
+        portable::sigmoid::sigmoid(args, input, output);
+    }
 }
 
 /// A borrowed backend is one: every method goes to the backend behind the reference.
@@ -467,6 +483,10 @@ impl<K: Kernels + ?Sized> Kernels for &K {
 
     fn softmax(&self, args: &SoftmaxArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
         (**self).softmax(args, input, output);
+    }
+
+    fn sigmoid(&self, args: &SigmoidArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
+        (**self).sigmoid(args, input, output);
     }
 }
 

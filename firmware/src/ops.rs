@@ -26,6 +26,7 @@ use crate::program::Step;
 mod add;
 mod attention;
 mod average_pool;
+mod branch_linear;
 mod concat;
 mod context;
 mod conv2d;
@@ -37,6 +38,7 @@ mod max_pool;
 mod requantize;
 mod rescale;
 mod resize_bilinear;
+mod sigmoid;
 mod softmax;
 mod term;
 mod tokens;
@@ -63,6 +65,8 @@ pub(crate) fn validate(step: &Step, context: &StepContext<'_, '_>) -> Result<u64
         Step::CopyBox(step) => copy_box::validate(step, context),
         Step::Concat(step) => concat::validate(step, context),
         Step::Softmax(step) => softmax::validate(step, context),
+        Step::BranchLinear(step) => branch_linear::validate(step, context),
+        Step::Sigmoid(step) => sigmoid::validate(step, context),
     }
 }
 
@@ -94,6 +98,8 @@ pub(crate) fn run<K: Kernels>(
         Step::CopyBox(step) => copy_box::run(step, &context, kernels, operands),
         Step::Concat(step) => concat::run(step, &context, kernels, operands),
         Step::Softmax(step) => softmax::run(step, &context, kernels, operands),
+        Step::BranchLinear(step) => branch_linear::run(step, &context, kernels, operands),
+        Step::Sigmoid(step) => sigmoid::run(step, &context, kernels, operands),
     }
 }
 

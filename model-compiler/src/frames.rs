@@ -41,6 +41,8 @@ pub struct FrameFormat {
     pub velocity: bool,
     /// Goal point.
     pub goal: bool,
+    /// Navigation command.
+    pub command: bool,
     /// Height that separates the two histogram channels: meters, relative to a sensor 2.5 m above ground.
     pub split_height_m: f64,
 }
@@ -56,6 +58,7 @@ impl FrameFormat {
             bev: None,
             velocity: false,
             goal: false,
+            command: false,
             split_height_m: split_height_m(system),
         };
         for (kind, shape) in inputs {
@@ -64,6 +67,7 @@ impl FrameFormat {
                 InputKind::Bev => format.bev = Some(shape),
                 InputKind::Velocity => format.velocity = true,
                 InputKind::Goal => format.goal = true,
+                InputKind::Command => format.command = true,
             }
         }
         format
@@ -72,7 +76,8 @@ impl FrameFormat {
     /// The same, of a classifier if there is nothing but one image to read and the first output is a vector.
     #[must_use]
     pub fn with_output(mut self, image_name: &str, output: Option<Shape>) -> Self {
-        let reads_only_an_image = self.image.is_some() && self.bev.is_none() && !self.velocity && !self.goal;
+        let reads_only_an_image =
+            self.image.is_some() && self.bev.is_none() && !self.velocity && !self.goal && !self.command;
         self.classes = output.filter(|s| reads_only_an_image && (s.height, s.width) == (1, 1)).map(|s| s.channels);
         if self.classes.is_some() {
             self.image_name = image_name.into();
@@ -126,7 +131,7 @@ pub struct Frame {
     pub velocity: Option<f64>,
     /// Goal `[right, forward-negative]`, m.
     pub goal: Option<[f64; 2]>,
-    /// Navigation command 1..=6; no network input here.
+    /// Navigation command 1..=6: left, right, straight, lane follow, change left, change right.
     pub command: Option<u8>,
     /// LiDAR points with a coordinate that is not finite; they are left out.
     pub dropped_points: usize,
@@ -135,7 +140,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The values of one network input in raw units: grey levels, counts, m/s, m.
+    /// The values of one network input in raw units: grey levels, counts, m/s, m, a command's number.
     ///
     /// # Errors
     /// The frame does not hold this input.
@@ -146,6 +151,7 @@ impl Frame {
             InputKind::Bev => self.bev.as_ref().map(bytes),
             InputKind::Velocity => self.velocity.map(|v| vec![v as f32]),
             InputKind::Goal => self.goal.map(|g| g.map(|v| v as f32).to_vec()),
+            InputKind::Command => self.command.map(|c| vec![f32::from(c)]),
         };
         values.ok_or_else(|| {
             Error::new(
@@ -169,7 +175,8 @@ impl Frame {
         }
     }
 
-    /// SHA-256 over everything that a network reads of this frame. The name does not count.
+    /// SHA-256 over everything that a network reads of this frame. The name does not count, nor the command: the
+    /// calibration runs a frame under every command.
     pub fn digest(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
         for kind in [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal] {
@@ -194,6 +201,7 @@ pub fn input_name(kind: InputKind) -> &'static str {
         InputKind::Bev => "bev",
         InputKind::Velocity => "velocity",
         InputKind::Goal => "goal",
+        InputKind::Command => "command",
     }
 }
 
@@ -297,7 +305,8 @@ mod tests {
         let bev = Shape::map(256, 256, 2);
         let late = FrameFormat::new("late_fusion", [(InputKind::Bev, bev), (InputKind::Goal, Shape::vector(2))]);
         assert_eq!(late.bev, Some(bev));
-        assert!(late.goal && !late.velocity && late.image.is_none());
+        assert!(late.goal && !late.velocity && !late.command && late.image.is_none());
+        assert!(FrameFormat::new("cilrs", [(InputKind::Command, Shape::vector(1))]).command);
         assert_eq!(late.split_height_m, 2.0);
         assert_eq!(FrameFormat::new("transfuser", []).split_height_m, -2.0);
     }
@@ -312,6 +321,8 @@ mod tests {
         assert_eq!(classes(&[camera], Some(Shape::vector(10))), Some(10));
         assert_eq!(classes(&[camera], Some(Shape::map(4, 1, 2))), None, "waypoints");
         assert_eq!(classes(&[camera, goal], Some(Shape::vector(10))), None);
+        let command = (InputKind::Command, Shape::vector(1));
+        assert_eq!(classes(&[camera, command], Some(Shape::vector(3))), None, "controls");
         assert_eq!(classes(&[camera], None), None);
     }
 }

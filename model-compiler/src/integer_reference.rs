@@ -14,14 +14,17 @@
 
 mod arithmetic;
 mod attention;
+mod branch_linear;
 mod concat;
 mod copy_box;
+mod gates;
 mod inputs;
 mod layer_norm;
 mod operands;
 mod pool;
 mod rescale;
 mod resize_bilinear;
+mod sigmoid;
 mod softmax;
 mod sum;
 #[cfg(test)]
@@ -166,6 +169,13 @@ fn dispatch(operands: &Operands, op: &QOp) -> Result<Vec<f64>> {
         }
         QOp::Softmax { input, output, exponent, exp_table } => {
             softmax::softmax(operands, *input, *output, &softmax::Exponential::new(*exponent, exp_table)?)
+        }
+        QOp::BranchLinear { input, command, output, branches, weights, wide: _, rescale } => {
+            branch_linear::branch_linear(operands, *input, *command, *output, *branches, weights, rescale)
+        }
+        QOp::Sigmoid { input, output, input_zero_point, requant, tanh_table } => {
+            let term = QTerm { tensor: *input, zero_point: *input_zero_point, multiplier: requant.multiplier };
+            sigmoid::sigmoid(operands, term, requant.shift, *output, tanh_table)
         }
     }
 }

@@ -52,6 +52,8 @@ pub enum InputKind {
     Velocity,
     /// Goal point `[right, forward-negative]`, m.
     Goal,
+    /// Navigation command, one number from 1 on: it selects a branch.
+    Command,
 }
 
 /// Bounds of a result: `min(max(x, min), max)`. ReLU is `0..∞`, ReLU6 `0..6`.
@@ -111,6 +113,29 @@ pub struct Linear {
     pub bias: Option<Arc<Vec<f32>>>,
     /// Bounds at the end (after the residual, if there is one).
     pub clip: Clip,
+}
+
+/// One of several linear layers of the same size, selected by a command: `clamp(command − 1, 0, branches − 1)`.
+#[derive(Clone, Debug)]
+pub struct BranchLinear {
+    /// `[branch][output][input]`.
+    pub weights: Arc<Weights>,
+    /// `[branch][output]`.
+    pub bias: Option<Arc<Vec<f32>>>,
+    /// Bounds at the end.
+    pub clip: Clip,
+}
+
+impl BranchLinear {
+    /// Number of branches.
+    pub fn branches(&self) -> usize {
+        self.weights.shape.first().copied().unwrap_or(0)
+    }
+
+    /// The branch that a command selects.
+    pub fn branch(&self, command: f32) -> usize {
+        ((command - 1.0).max(0.0) as usize).min(self.branches().saturating_sub(1))
+    }
 }
 
 /// Inference batch norm: `(x − mean)·weight/√(var + eps) + bias`.
@@ -248,6 +273,10 @@ pub enum Op {
     Concat(Axis),
     /// `[x]`: `exp(x) / Σ exp(x)` over the channels of each position.
     Softmax,
+    /// `[x, command]`.
+    BranchLinear(BranchLinear),
+    /// `[x]`: `1 / (1 + exp(−x))` of each element.
+    Sigmoid,
 }
 
 /// One operator application.
@@ -355,6 +384,8 @@ impl Op {
             Self::Pad(_) => "pad",
             Self::Concat(_) => "concat",
             Self::Softmax => "softmax",
+            Self::BranchLinear(_) => "branch_linear",
+            Self::Sigmoid => "sigmoid",
         }
     }
 

@@ -10,6 +10,7 @@ use builder::Builder;
 
 mod aim;
 mod builder;
+mod cilrs;
 mod detect;
 mod head;
 mod late_fusion;
@@ -32,7 +33,7 @@ fn has(tensors: &NamedTensors, prefix: &str) -> bool {
 pub(super) fn detect(tensors: &NamedTensors) -> Option<System> {
     let recognized: [(System, bool); 6] = [
         (System::Lbc, has(tensors, "net.network.backbone.")),
-        (System::Cilrs, has(tensors, "encoder.features.") && has(tensors, "controller.")),
+        (System::Cilrs, cilrs::recognize(tensors)),
         (System::GeometricFusion, has(tensors, "encoder.image_conv") || has(tensors, "encoder.image_projection")),
         (System::TransFuser, transfuser::recognize(tensors)),
         (System::LateFusion, late_fusion::recognize(tensors)),
@@ -47,10 +48,11 @@ pub(super) fn build(system: System, name: &str, tensors: NamedTensors, options: 
         System::Aim => aim::build,
         System::LateFusion => late_fusion::build,
         System::TransFuser => transfuser::build,
-        System::GeometricFusion | System::Cilrs | System::Lbc => {
+        System::Cilrs => cilrs::build,
+        System::GeometricFusion | System::Lbc => {
             let message = format!("this is a checkpoint of {}, which is not supported", system.name());
             return Err(Error::new(ErrorCode::Unsupported, "", message)
-                .with_help("supported are aim, late_fusion and transfuser"));
+                .with_help("supported are aim, cilrs, late_fusion and transfuser"));
         }
     };
     let mut builder = Builder::new(name, system, tensors, options);

@@ -103,10 +103,15 @@ impl<'a> Builder<'a> {
 
     /// Linear layer with bias.
     pub(super) fn linear(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
+        self.linear_as(module, module, input, outputs)
+    }
+
+    /// Linear layer with bias, its result under a name of its own.
+    pub(super) fn linear_as(&mut self, name: &str, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
         let inputs = usize::from(self.graph.value(input).shape.channels);
         let weights = self.weights(&format!("{module}.weight"), &[outputs, inputs]);
         let bias = Some(self.vector(&format!("{module}.bias"), &[outputs]));
-        self.push(module, Op::Linear(Linear { weights, bias, clip: Clip::NONE }), &[input])
+        self.push(name, Op::Linear(Linear { weights, bias, clip: Clip::NONE }), &[input])
     }
 
     /// Weight and bias of a LayerNorm, for rows `first_row ..` as a map of `grid`.
