@@ -31,8 +31,8 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
     }
     let velocity = format.velocity.then(|| batch.floats("velocity", &[])).transpose()?;
     let goal = format.goal.then(|| batch.floats("target", &[2])).transpose()?;
+    let command = batch.commands(format.command)?;
     let count = batch.frames.unwrap_or(0);
-    let command = batch.commands(count, format.command)?;
     let labels = format.classes.map(|classes| batch.labels(classes)).transpose()?.flatten();
     if count == 0 {
         return Err(Error::new(ErrorCode::Frames, "", "holds no frame that this network could read"));
@@ -143,10 +143,13 @@ impl<'a> Batch<'a> {
     }
 
     /// Commands of a network that reads them; of others used where they fit, ignored where not.
-    fn commands(&mut self, frames: usize, needed: bool) -> Result<Option<Vec<u8>>> {
+    fn commands(&mut self, needed: bool) -> Result<Option<Vec<u8>>> {
         let found = match needed {
             true => Some(self.tensor("command", Dtype::I32, &[])?),
-            false => self.file.tensor("command").ok().filter(|v| v.dtype() == Dtype::I32 && v.shape() == [frames]),
+            false => {
+                let fits = |v: &TensorView<'_>| v.dtype() == Dtype::I32 && v.shape() == [self.frames.unwrap_or(0)];
+                self.file.tensor("command").ok().filter(fits)
+            }
         };
         let Some(view) = found else { return Ok(None) };
         let command = |bytes: &[u8; 4]| {

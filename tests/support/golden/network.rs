@@ -6,7 +6,7 @@ use model_compiler::import::{NamedTensor, NamedTensors, System, TensorData};
 /// Sizes of a network; the published ones, small ones for fast tests, or an ablation of either.
 #[derive(Clone, Debug)]
 pub struct Network {
-    /// Which of the three waypoint systems.
+    /// Which of the published systems.
     pub system: System,
     /// Channels of stem and first stage.
     pub stem: usize,
@@ -28,6 +28,10 @@ pub struct Network {
     pub join: Vec<usize>,
     /// Input width of the GRU: 2 (added) or 4 (concatenated).
     pub gru_inputs: usize,
+    /// Of CILRS: hidden size of its heads.
+    pub hidden: usize,
+    /// Of CILRS: branches, one per command.
+    pub branches: usize,
 }
 
 impl Network {
@@ -37,7 +41,7 @@ impl Network {
             system,
             stem: 64,
             widths: [64, 128, 256, 512],
-            image_blocks: [3, 4, 6, 3],
+            image_blocks: if system == System::Cilrs { [2; 4] } else { [3, 4, 6, 3] },
             lidar_blocks: [2; 4],
             layers: 8,
             grid: (8, 8),
@@ -45,6 +49,8 @@ impl Network {
             scales: vec![1, 2, 3, 4],
             join: vec![256, 128, 64],
             gru_inputs: if system == System::TransFuser { 2 } else { 4 },
+            hidden: 256,
+            branches: 6,
         }
     }
 
@@ -58,6 +64,7 @@ impl Network {
             layers: 2,
             grid: (2, 2),
             join: vec![24, 16],
+            hidden: 16,
             ..Self::published(system)
         }
     }
@@ -70,6 +77,11 @@ impl Network {
     /// Names and shapes of the checkpoint.
     pub fn shapes(&self) -> Vec<(String, Vec<usize>)> {
         let mut list = List(Vec::new());
+        if self.system == System::Cilrs {
+            self.resnet(&mut list, "encoder.features", 3, &self.image_blocks);
+            self.controller(&mut list);
+            return list.0;
+        }
         let root = if self.system == System::TransFuser { "encoder." } else { "" };
         self.resnet(&mut list, &format!("{root}image_encoder.features"), 3, &self.image_blocks);
         if self.system != System::Aim {
@@ -151,6 +163,18 @@ impl Network {
         list.norm(&format!("{prefix}.ln_f"), c);
     }
 
+    fn controller(&self, list: &mut List) {
+        list.linear("controller.vel_in.0", self.hidden, 1);
+        list.linear("controller.vel_in.2", self.widths[3], self.hidden);
+        let mut head = |module: &str, outputs: usize| {
+            list.linear(&format!("{module}.0"), self.hidden, self.widths[3]);
+            list.linear(&format!("{module}.2"), self.hidden, self.hidden);
+            list.linear(&format!("{module}.4"), outputs, self.hidden);
+        };
+        head("controller.vel_out", 1);
+        (0..self.branches).for_each(|branch| head(&format!("controller.branches.{branch}"), 3));
+    }
+
     fn head(&self, list: &mut List) {
         let mut input = self.widths[3];
         for (layer, &width) in self.join.iter().enumerate() {
@@ -211,7 +235,7 @@ mod tests {
 
     #[test]
     fn published_networks_have_the_published_names_and_shapes() {
-        for system in [System::Aim, System::LateFusion, System::TransFuser] {
+        for system in [System::Aim, System::LateFusion, System::TransFuser, System::Cilrs] {
             let mut shapes = Network::published(system).shapes();
             shapes.sort();
             assert_eq!(shapes, golden::shapes(system), "{}", system.name());
