@@ -19,26 +19,26 @@ use tests::{build, every_step};
 
 /// Kinds of step at which a fault may first show: it depends on the network which of them comes first.
 fn expected_operators(fault: Fault) -> &'static [&'static str] {
-    const WEIGHTED: &[&str] = &["conv2d", "linear"];
+    const WEIGHTED: &[&str] = &["conv2d", "linear", "branch_linear"];
     match fault {
         Fault::TieDown | Fault::TieAwayFromZero | Fault::DoubleRounding | Fault::ClampOrder => &every_step::OPERATORS,
         Fault::PaddingZeroPoint | Fault::LastRow | Fault::LastColumn => &["conv2d"],
         Fault::ResidualZeroPoint => &["conv2d", "linear", "add", "resize_bilinear"],
-        Fault::GateOrder | Fault::ResetBeforeBias | Fault::TanhNextEntry | Fault::GoalFirstStepOnly => {
-            &["waypoint_decoder"]
-        }
+        Fault::GateOrder | Fault::ResetBeforeBias | Fault::GoalFirstStepOnly => &["waypoint_decoder"],
+        Fault::TanhNextEntry => &["waypoint_decoder", "sigmoid"],
         Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention", "softmax"],
         Fault::LayerNormEpsilon => &["layer_norm"],
         Fault::DepthTail | Fault::MultiplierPlusOne | Fault::ChannelsSwapped => WEIGHTED,
         // Where the bytes in front of the scratch belong to an operand of the same step, the engine refuses to cut
         // overlapping slices; where they belong to another tensor, its next reader gives wrong bytes.
-        Fault::ScratchOverlap => &["conv2d", "linear", "attention", "waypoint_decoder"],
+        Fault::ScratchOverlap => &["conv2d", "linear", "branch_linear", "attention", "waypoint_decoder"],
         Fault::ResizeWeights => &["resize_bilinear"],
         Fault::TokenOrder => &["tokens"],
         Fault::MaxPoolPadding => &["max_pool"],
         Fault::PoolSecondMap => &["global_pool"],
         Fault::BoxOffset | Fault::BorderZero => &["copy_box"],
         Fault::ConcatOrder => &["concat"],
+        Fault::BranchFromZero => &["branch_linear"],
     }
 }
 
@@ -87,6 +87,7 @@ fn subjects(folder: &Path) -> Vec<Subject> {
         small("TransFuser, i8 skips", System::TransFuser, SkipStages::narrow()),
         small("TransFuser, i16 skips", System::TransFuser, SkipStages::wide()),
         small("Late Fusion, i8 skips", System::LateFusion, SkipStages::narrow()),
+        small("CILRS, i8 skips", System::Cilrs, SkipStages::narrow()),
         Subject::write(folder, "every step", &every_step::compiled(), &every_step::frames(7, 4)),
     ]
 }
@@ -200,12 +201,15 @@ fn write_inputs(path: &Path, frames: &[Frame]) {
     let bev: Vec<u8> = frames.iter().flat_map(|frame| planes(&frame.bev)).collect();
     let velocity = floats(frames.iter().filter_map(|frame| frame.velocity).collect());
     let target = floats(frames.iter().filter_map(|frame| frame.goal).flatten().collect());
+    let commands = frames.iter().map(|frame| i32::from(frame.command.unwrap_or(0)));
+    let command: Vec<u8> = commands.flat_map(i32::to_le_bytes).collect();
     let view = |element, shape, data| TensorView::new(element, shape, data).expect("a tensor");
     let tensors = [
         ("rgb", view(Dtype::U8, shape(&frames[0].rgb), &rgb)),
         ("bev", view(Dtype::U8, shape(&frames[0].bev), &bev)),
         ("velocity", view(Dtype::F32, vec![frames.len()], &velocity)),
         ("target", view(Dtype::F32, vec![frames.len(), 2], &target)),
+        ("command", view(Dtype::I32, vec![frames.len()], &command)),
     ];
     let bytes = safetensors::serialize(tensors, None).expect("serializable");
     std::fs::write(path, bytes).unwrap_or_else(|e| panic!("{}: {e}", path.display()));

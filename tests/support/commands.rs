@@ -172,12 +172,14 @@ pub fn inputs_file(frames: &[Frame]) -> Vec<u8> {
     let floats = |values: fn(&Frame) -> Vec<f64>| -> Vec<u8> {
         frames.iter().flat_map(values).flat_map(|v| (v as f32).to_le_bytes()).collect()
     };
+    let commands = frames.iter().flat_map(|f| i32::from(f.command.expect("a command")).to_le_bytes()).collect();
     let (rgb, bev) = (maps(|f| &f.rgb), maps(|f| &f.bev));
     let tensors = [
         ("rgb", Dtype::U8, rgb.0, rgb.1),
         ("bev", Dtype::U8, bev.0, bev.1),
         ("velocity", Dtype::F32, vec![frames.len()], floats(|f| vec![f.velocity.expect("a speed")])),
         ("target", Dtype::F32, vec![frames.len(), 2], floats(|f| f.goal.expect("a goal").to_vec())),
+        ("command", Dtype::I32, vec![frames.len()], commands),
     ];
     let views = tensors.iter().map(|(name, element, shape, data)| {
         (*name, TensorView::new(*element, shape.clone(), data).expect("shape and data agree"))

@@ -40,8 +40,11 @@ pub mod ids {
     pub const BOX: u16 = 23;
     pub const JOINED: u16 = 24;
     pub const PROBABILITIES: u16 = 25;
+    pub const COMMAND: u16 = 26;
+    pub const BRANCH: u16 = 27;
+    pub const CONTROLS: u16 = 28;
     /// First scratch record.
-    pub const SCRATCH: u16 = 26;
+    pub const SCRATCH: u16 = 29;
 }
 
 /// Positions of the sample's steps.
@@ -66,9 +69,11 @@ pub mod at {
     pub const COPY_BOX: usize = 19;
     pub const CONCAT: usize = 20;
     pub const SOFTMAX: usize = 21;
+    pub const BRANCH_LINEAR: usize = 22;
+    pub const SIGMOID: usize = 23;
 }
 
-pub const STEPS: usize = 22;
+pub const STEPS: usize = 24;
 
 /// Deterministic constants.
 struct Numbers {
@@ -150,8 +155,13 @@ pub fn parts() -> ImageParts {
             port("bev", ids::LIDAR),
             port("velocity", ids::VELOCITY),
             port("goal", ids::GOAL),
+            port("command", ids::COMMAND),
         ],
-        outputs: vec![port("waypoints", ids::WAYPOINTS), port("probabilities", ids::PROBABILITIES)],
+        outputs: vec![
+            port("waypoints", ids::WAYPOINTS),
+            port("probabilities", ids::PROBABILITIES),
+            port("controls", ids::CONTROLS),
+        ],
         arena_bytes,
         arena_alignment: 16,
         qmodel_digest: [7; 32],
@@ -189,6 +199,9 @@ fn shapes() -> Vec<(Shape, ElementType)> {
         (Shape::map(3, 4, 8), I8),
         (Shape::map(7, 4, 8), I16),
         (Shape::map(7, 4, 8), I16),
+        (Shape::vector(1), I8),
+        (Shape::vector(3), I16),
+        (Shape::vector(3), I16),
     ]
 }
 
@@ -257,6 +270,8 @@ fn steps(n: &mut Numbers) -> Vec<Step> {
         }),
         concat(),
         softmax(n),
+        branch_linear(n),
+        sigmoid(n),
     ]
 }
 
@@ -366,9 +381,11 @@ fn resize(n: &mut Numbers) -> Step {
     })
 }
 
+fn tanh_table() -> Vec<i16> {
+    (0..513).map(|k| ((f64::from(k) / 64.0).tanh() * 32768.0).round().min(32767.0) as i16).collect()
+}
+
 fn decoder(n: &mut Numbers) -> Step {
-    let table: Vec<i16> =
-        (0..513).map(|k| ((f64::from(k) / 64.0).tanh() * 32768.0).round().min(32767.0) as i16).collect();
     Step::WaypointDecoder(WaypointDecoder {
         hidden: TensorId(ids::HIDDEN),
         goal: TensorId(ids::GOAL),
@@ -387,7 +404,7 @@ fn decoder(n: &mut Numbers) -> Step {
         output_bias: n.push(2, -1000, 1000, |v| v),
         output_pre_shift: 0,
         output_requant: [requant(); 2],
-        tanh_table: n.builder.push(&table).expect("fits"),
+        tanh_table: n.builder.push(&tanh_table()).expect("fits"),
         scratch: None,
     })
 }
@@ -413,6 +430,30 @@ fn softmax(n: &mut Numbers) -> Step {
     })
 }
 
+fn branch_linear(n: &mut Numbers) -> Step {
+    Step::BranchLinear(BranchLinear {
+        input: TensorId(ids::VECTOR),
+        command: TensorId(ids::COMMAND),
+        output: TensorId(ids::BRANCH),
+        branches: 4,
+        kernel: KernelId::Direct,
+        weights: n.weights(4 * 3 * 8),
+        wide: false,
+        rescale: n.rescale(4 * 3, I16, Residual::None),
+        scratch: None,
+    })
+}
+
+fn sigmoid(n: &mut Numbers) -> Step {
+    Step::Sigmoid(Sigmoid {
+        input: TensorId(ids::BRANCH),
+        output: TensorId(ids::CONTROLS),
+        input_zero_point: 0,
+        requant: requant(),
+        tanh_table: n.builder.push(&tanh_table()).expect("fits"),
+    })
+}
+
 /// Pairs of output and overwritten operand.
 fn in_place(shapes: &[(Shape, ElementType)]) -> Vec<(u16, u16)> {
     let mut pairs = vec![
@@ -422,6 +463,7 @@ fn in_place(shapes: &[(Shape, ElementType)]) -> Vec<(u16, u16)> {
         (ids::SUM, ids::LIDAR_NARROW),
         (ids::BLOCK, ids::FUSED),
         (ids::PROBABILITIES, ids::JOINED),
+        (ids::CONTROLS, ids::BRANCH),
     ];
     let [input, output] = [ids::STEM, ids::POOLED].map(|id| shapes[usize::from(id)].0);
     if plan::max_pool_in_place(input, output, Window::square(2, 2, 0)) {
@@ -492,6 +534,10 @@ fn scratch_bytes(step: &Step, records: &[TensorRecord]) -> u32 {
             let input = record(s.input);
             plan::linear_scratch_bytes(s.kernel, input.shape.positions(), input.shape.channels, input.element)
         }
+        Step::BranchLinear(s) => {
+            let input = record(s.input);
+            plan::linear_scratch_bytes(s.kernel, input.shape.positions(), input.shape.channels, input.element)
+        }
         Step::Attention(s) => {
             let shape = record(s.output).shape;
             plan::attention_scratch_bytes(shape.positions(), shape.channels, s.heads).max(16)
@@ -505,6 +551,7 @@ fn set_scratch(step: &mut Step, id: TensorId) {
     match step {
         Step::Conv2d(s) => s.scratch = Some(id),
         Step::Linear(s) => s.scratch = Some(id),
+        Step::BranchLinear(s) => s.scratch = Some(id),
         Step::Attention(s) => s.scratch = Some(id),
         Step::WaypointDecoder(s) => s.scratch = Some(id),
         _ => unreachable!("no scratch"),
