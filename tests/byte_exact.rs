@@ -18,7 +18,8 @@ use model_compiler::quantize::{QuantizeOptions, SkipStages};
 use tests::build;
 use tests::golden::{self, Network};
 
-const SYSTEMS: [System; 4] = [System::Aim, System::LateFusion, System::TransFuser, System::GeometricFusion];
+const SYSTEMS: [System; 5] =
+    [System::Aim, System::LateFusion, System::TransFuser, System::GeometricFusion, System::Cilrs];
 
 fn assert_byte_exact(compiled: &Compiled, frames: &[Frame], backend: Backend) {
     let bytes = AlignedBytes::from(compiled.image.as_slice());

@@ -4,7 +4,7 @@ use model_compiler::import::System;
 use serde_json::Value;
 use tests::build;
 use tests::commands::{self, Folder};
-use tests::golden::Network;
+use tests::golden::{self, Network};
 
 /// A folder with a network's checkpoint, inputs and image.
 fn compiled(network: &Network) -> Folder {
@@ -97,6 +97,23 @@ fn run_prints_waypoints_of_image_and_checkpoint() {
     // What the table shows is what the document holds.
     let row: Vec<&str> = text.lines().find(|l| l.contains("inputs#1")).unwrap().split_whitespace().skip(1).collect();
     assert_eq!(row, waypoints(&int8, 1).iter().map(|m| format!("{m:.3}")).collect::<Vec<_>>());
+}
+
+#[test]
+fn run_of_a_published_network_gives_the_original_controls() {
+    let folder = Folder::default();
+    golden::write_safetensors(&golden::checkpoint(System::Cilrs), &folder.path("net.safetensors")).unwrap();
+    let inputs = golden::path("inputs.safetensors").display().to_string();
+    let (status, document) = folder.json(&format!("host-sim run @net.safetensors --inputs {inputs} --json"));
+    assert_eq!(status, 0, "{document}");
+    let expected = golden::expected(System::Cilrs).results;
+    for (i, frame) in document["frames"].as_array().expect("frames").iter().enumerate() {
+        let controls = ["steer", "throttle", "brake"].map(|name| (name, &frame["controls"][name]));
+        for (name, found) in controls.into_iter().chain([("velocity", &frame["predicted_speed"])]) {
+            let error = (found.as_f64().expect("a number") - f64::from(expected[name][i][0])).abs();
+            assert!(error < 1e-3, "frame {i}, {name}: {found}, expected {}", expected[name][i][0]);
+        }
+    }
 }
 
 #[test]

@@ -18,20 +18,19 @@ use tests::{build, commands, every_step};
 
 /// Kinds of step at which a fault may first show: it depends on the network which of them comes first.
 fn expected_operators(fault: Fault) -> &'static [&'static str] {
-    const WEIGHTED: &[&str] = &["conv2d", "linear"];
+    const WEIGHTED: &[&str] = &["conv2d", "linear", "branch_linear"];
     match fault {
         Fault::TieDown | Fault::TieAwayFromZero | Fault::DoubleRounding | Fault::ClampOrder => &every_step::OPERATORS,
         Fault::PaddingZeroPoint | Fault::LastRow | Fault::LastColumn => &["conv2d"],
         Fault::ResidualZeroPoint => &["conv2d", "linear", "add", "resize_bilinear"],
-        Fault::GateOrder | Fault::ResetBeforeBias | Fault::TanhNextEntry | Fault::GoalFirstStepOnly => {
-            &["waypoint_decoder"]
-        }
+        Fault::GateOrder | Fault::ResetBeforeBias | Fault::GoalFirstStepOnly => &["waypoint_decoder"],
+        Fault::TanhNextEntry => &["waypoint_decoder", "sigmoid"],
         Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention", "softmax"],
         Fault::LayerNormEpsilon => &["layer_norm"],
         Fault::DepthTail | Fault::MultiplierPlusOne | Fault::ChannelsSwapped => WEIGHTED,
         // Where the bytes in front of the scratch belong to an operand of the same step, the engine refuses to cut
         // overlapping slices; where they belong to another tensor, its next reader gives wrong bytes.
-        Fault::ScratchOverlap => &["conv2d", "linear", "attention", "waypoint_decoder"],
+        Fault::ScratchOverlap => &["conv2d", "linear", "branch_linear", "attention", "waypoint_decoder"],
         Fault::ResizeWeights => &["resize_bilinear"],
         Fault::TokenOrder => &["tokens"],
         Fault::MaxPoolPadding => &["max_pool"],
@@ -39,6 +38,7 @@ fn expected_operators(fault: Fault) -> &'static [&'static str] {
         Fault::BoxOffset | Fault::BorderZero => &["copy_box"],
         Fault::ConcatOrder => &["concat"],
         Fault::GatherTransposed => &["gather_sum"],
+        Fault::BranchFromZero => &["branch_linear"],
     }
 }
 
@@ -87,6 +87,7 @@ fn subjects(folder: &Path) -> Vec<Subject> {
         small("TransFuser, i8 skips", System::TransFuser, SkipStages::narrow()),
         small("TransFuser, i16 skips", System::TransFuser, SkipStages::wide()),
         small("Late Fusion, i8 skips", System::LateFusion, SkipStages::narrow()),
+        small("CILRS, i8 skips", System::Cilrs, SkipStages::narrow()),
         Subject::write(folder, "every step", &every_step::compiled(), &every_step::frames(7, 4)),
     ]
 }

@@ -36,6 +36,58 @@ fn run_gives_waypoints_of_an_image_and_of_its_checkpoint() {
     assert_eq!(table.err, "");
 }
 
+/// Steer, throttle, brake and predicted speed of a frame.
+fn controls(document: &Value, frame: usize) -> Vec<f64> {
+    let frame = &document["frames"][frame];
+    let controls = ["steer", "throttle", "brake"].map(|name| &frame["controls"][name]);
+    controls.into_iter().chain([&frame["predicted_speed"]]).map(|value| value.as_f64().unwrap()).collect()
+}
+
+#[test]
+fn run_gives_controls_of_an_image_and_of_its_checkpoint() {
+    let project = Project::new(System::Cilrs);
+    let (status, int8) = project.json("run net.img --inputs inputs.safetensors --json");
+    assert_eq!(status, 0, "{int8}");
+    let (status, float) = project.json("run net.safetensors --inputs inputs.safetensors --json");
+    assert_eq!(status, 0, "{float}");
+    for frame in 0..4 {
+        let (int8, float) = (controls(&int8, frame), controls(&float, frame));
+        assert!(int8.iter().zip(&float).all(|(i, f)| (i - f).abs() < 0.1), "int8 {int8:?}, f32 {float:?}");
+        // Codes of Q15: steer by 2, throttle by 3/4, brake as it is.
+        let codes = [int8[0] * 16384.0, int8[1] * 131_072.0 / 3.0, int8[2] * 32768.0];
+        assert!(codes.iter().all(|code| code.fract() == 0.0), "{codes:?}");
+    }
+    let table = project.host_sim("run net.img --inputs inputs.safetensors");
+    assert!(table.out.contains("throttle") && table.out.contains("speed, m/s"), "{}", table.out);
+}
+
+#[test]
+fn a_network_of_controls_is_verified_by_their_errors() {
+    let project = Project::new(System::Cilrs);
+    let gate = project.path("gates.toml");
+    std::fs::write(&gate, "max_control_error = 0.1\nmin_output_sqnr_db = 20").unwrap();
+    let command =
+        format!("verify net.img --model net.safetensors --inputs inputs.safetensors --gate {}", gate.display());
+    let (status, report) = project.json(&format!("{command} --json"));
+    assert_eq!((status, &report["bytes_equal"]), (0, &true.into()), "{report}");
+    let errors = report["summary"]["control_error"].as_array().unwrap();
+    let names: Vec<_> = errors.iter().map(|error| error["name"].as_str().unwrap()).collect();
+    assert_eq!(names, ["steer", "throttle", "brake", "predicted_speed"]);
+    assert!(errors.iter().all(|error| error["max"].as_f64().unwrap() >= error["mean"].as_f64().unwrap()));
+    assert!(report["frames"][3]["reference_control"]["controls"]["brake"].is_f64(), "{report}");
+    assert_eq!(report["summary"]["waypoint_error_mm"].as_array().unwrap().len(), 0);
+    let text = project.host_sim(&format!("{command} --report {}", project.path("page").display()));
+    assert!(text.out.contains("steer") && text.out.contains("off on average"), "{}", text.out);
+    let page = std::fs::read_to_string(project.path("page").join("report.html")).unwrap();
+    assert!(page.contains("id=\"controls\"") && page.contains("Control error"));
+    let ablation = project.host_sim("ablate net.safetensors --calib inputs.safetensors --inputs inputs.safetensors");
+    assert!(ablation.out.contains("worst throttle"), "{}{}", ablation.out, ablation.err);
+    let bench = project.host_sim("bench net.img --rounds 1");
+    assert!(bench.status == 0 && bench.out.contains("branch_linear"), "{}{}", bench.out, bench.err);
+    std::fs::write(&gate, "max_control_error = 0").unwrap();
+    assert_eq!(project.host_sim(&command).status, 1);
+}
+
 #[test]
 fn verify_proves_bytes_and_measures_every_step() {
     let project = Project::new(System::TransFuser);

@@ -35,12 +35,17 @@ fn published_checkpoints_have_the_published_sizes() {
         (System::TransFuser, 66_293_634, 11.632),
         // Of 40,919,554 without image_projection2 and lidar_conv4; of 8.512 G without lidar_conv4.
         (System::GeometricFusion, 39_868_930, 8.495),
+        (System::Cilrs, 12_693_331, 2.370),
     ] {
         let mut graph = import_default(golden::checkpoint(system));
         assert_eq!(graph.system, system.name());
         assert_eq!(graph.parameters(), parameters, "{}", system.name());
         assert_eq!((graph.macs() as f64 / 1e6).round() / 1e3, giga_macs, "{}", system.name());
-        assert_eq!(shape_of(&graph, "waypoints"), Shape::tokens(4, 2));
+        let (output, shape) = match system {
+            System::Cilrs => ("controls", Shape::vector(3)),
+            _ => ("waypoints", Shape::tokens(4, 2)),
+        };
+        assert_eq!(shape_of(&graph, output), shape);
         let taps = golden::expected(system).taps;
         let macs = graph.macs();
         for optimized in [false, true] {
@@ -138,13 +143,16 @@ fn inputs_and_outputs_have_their_names() {
         (System::LateFusion, vec!["rgb", "bev", "goal"]),
         (System::TransFuser, vec!["rgb", "bev", "velocity", "goal"]),
         (System::GeometricFusion, vec!["rgb", "bev", "bev_points", "cam_points", "goal"]),
+        (System::Cilrs, vec!["rgb", "velocity", "command"]),
     ] {
         let network = Network::small(system);
         let options = ImportOptions { resolution: Some(network.resolution()), ..Default::default() };
         let mut graph = import("small", network.tensors(), &options).unwrap();
         for _ in 0..2 {
             assert_eq!(graph.inputs().map(|(id, _)| graph.value(id).name.as_str()).collect::<Vec<_>>(), inputs);
-            assert_eq!(graph.outputs, [graph.find("waypoints").unwrap()]);
+            let outputs: &[&str] =
+                if system == System::Cilrs { &["controls", "predicted_speed"] } else { &["waypoints"] };
+            assert_eq!(graph.outputs.iter().map(|&id| &*graph.value(id).name).collect::<Vec<_>>(), outputs);
             assert_eq!(shape_of(&graph, "rgb"), Shape::map(64, 64, 3));
             optimize(&mut graph).unwrap();
         }

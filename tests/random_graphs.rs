@@ -26,7 +26,7 @@ const LOCAL_FLOOR_DB: f64 = 28.0;
 const FLOOR_DB: f64 = 15.0;
 
 /// Operators that must occur.
-const OPERATORS: [&str; 12] = [
+const OPERATORS: [&str; 13] = [
     "conv2d",
     "linear",
     "max_pool",
@@ -39,6 +39,7 @@ const OPERATORS: [&str; 12] = [
     "concat",
     "softmax",
     "gather_sum",
+    "sigmoid",
 ];
 
 /// A network of a seed, compiled with options that alternate.

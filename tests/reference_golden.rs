@@ -1,6 +1,7 @@
-//! The f32 reference meets what the original networks gave: waypoints and the means of inner features, at full size,
-//! for the graph as imported and as optimized.
+//! The f32 reference meets what the original networks gave: waypoints or controls and the means of inner features, at
+//! full size, for the graph as imported and as optimized.
 
+use host_sim::controls::ControlOutputs;
 use host_sim::statistics::ErrorSums;
 use model_compiler::import::{ImportOptions, System, import};
 use model_compiler::ir::{Graph, InputKind, ValueId};
@@ -8,8 +9,8 @@ use model_compiler::{passes, reference};
 use std::collections::BTreeMap;
 use tests::golden::{self, Expected, Frame};
 
-/// Meters.
-const WAYPOINT_TOLERANCE: f32 = 1e-3;
+/// Meters, m/s, or of a control.
+const RESULT_TOLERANCE: f32 = 1e-3;
 
 /// Of the expected mean, or of [`TAP_FLOOR`] times the largest mean of the same tap and frame where that is more: a
 /// mean of signed features may cancel to nothing, and then has no relative error.
@@ -24,6 +25,7 @@ fn raw_inputs(graph: &Graph, frame: &Frame) -> Vec<Vec<f32>> {
         InputKind::Goal => frame.target.to_vec(),
         InputKind::BevPoints => frame.bev_points.clone(),
         InputKind::CameraPoints => frame.camera_points.clone(),
+        InputKind::Command => vec![frame.command as f32],
     };
     graph.inputs().map(|(_, kind)| raw(kind)).collect()
 }
@@ -48,6 +50,15 @@ fn within(error: f32, tolerance: f32) -> bool {
     error <= tolerance
 }
 
+/// The outputs of a graph under the names of the stored results.
+fn results(graph: &Graph, outputs: &[Vec<f32>]) -> Vec<(&'static str, Vec<f32>)> {
+    let names = graph.outputs.iter().map(|&id| graph.value(id).name.as_str());
+    let Some(controls) = ControlOutputs::find(names) else { return vec![("waypoints", outputs[0].clone())] };
+    let prediction = controls.read(outputs).expect("three controls");
+    let stored = |name| if name == "predicted_speed" { "velocity" } else { name };
+    prediction.values().map(|(name, value)| (stored(name), vec![value as f32])).collect()
+}
+
 /// Runs all frames; prints the worst errors, panics with all that are too large.
 fn check(what: &str, graph: &Graph, frames: &[Frame], expected: &Expected) {
     let taps: BTreeMap<ValueId, &str> = expected
@@ -58,7 +69,7 @@ fn check(what: &str, graph: &Graph, frames: &[Frame], expected: &Expected) {
         })
         .collect();
     let mut misses = Vec::new();
-    let (mut worst_tap, mut worst_waypoint) = (0.0_f32, 0.0_f32);
+    let (mut worst_tap, mut worst_result) = (0.0_f32, 0.0_f32);
     for (i, frame) in frames.iter().enumerate() {
         let mut seen = 0;
         let outputs = reference::run(graph, &raw_inputs(graph, frame), |node, map| {
@@ -73,16 +84,20 @@ fn check(what: &str, graph: &Graph, frames: &[Frame], expected: &Expected) {
         })
         .unwrap_or_else(|e| panic!("{what}: {e}"));
         assert_eq!(seen, expected.taps.len(), "{what}: every tap is computed");
-        let waypoints = expected.waypoints[i].as_flattened();
-        let mut errors = ErrorSums::default();
-        errors.add(waypoints, &outputs[0]);
-        let error = errors.largest_error() as f32;
-        worst_waypoint = worst_waypoint.max(error);
-        if !within(error, WAYPOINT_TOLERANCE) {
-            misses.push(format!("frame {i}: waypoints {:?}, expected {waypoints:?}", outputs[0]));
+        let found = results(graph, &outputs);
+        assert_eq!(found.len(), expected.results.len(), "{what}: every result is computed");
+        for (name, found) in found {
+            let result = &expected.results[name][i];
+            let mut errors = ErrorSums::default();
+            errors.add(result, &found);
+            let error = errors.largest_error() as f32;
+            worst_result = worst_result.max(error);
+            if !within(error, RESULT_TOLERANCE) {
+                misses.push(format!("frame {i}: {name} {found:?}, expected {result:?}"));
+            }
         }
     }
-    println!("{what}: waypoints within {worst_waypoint:.1e} m, inner features within {worst_tap:.1e}");
+    println!("{what}: results within {worst_result:.1e}, inner features within {worst_tap:.1e}");
     assert!(misses.is_empty(), "{what}:\n{}", misses.join("\n"));
 }
 
@@ -112,4 +127,9 @@ fn transfuser_meets_the_original() {
 #[test]
 fn geometric_fusion_meets_the_original() {
     meets_the_original(System::GeometricFusion);
+}
+
+#[test]
+fn cilrs_meets_the_original() {
+    meets_the_original(System::Cilrs);
 }

@@ -62,11 +62,13 @@ pub enum Fault {
     ConcatOrder,
     /// Gathered cells are addressed by column and row.
     GatherTransposed,
+    /// Commands count from 0: the block behind the chosen one is used.
+    BranchFromZero,
 }
 
 impl Fault {
     /// All faults, for tests and `--fault NAME`.
-    pub const ALL: [Fault; 27] = [
+    pub const ALL: [Fault; 28] = [
         Self::TieDown,
         Self::TieAwayFromZero,
         Self::DoubleRounding,
@@ -94,6 +96,7 @@ impl Fault {
         Self::BorderZero,
         Self::ConcatOrder,
         Self::GatherTransposed,
+        Self::BranchFromZero,
     ];
 }
 

@@ -303,6 +303,17 @@ pub struct GatherSumArgs<'a> {
     pub requant: RequantArgs,
 }
 
+/// Arguments of [`Kernels::sigmoid`].
+#[derive(Clone, Copy, Debug)]
+pub struct SigmoidArgs<'a> {
+    /// `z`.
+    pub input_zero_point: i16,
+    /// M, n: to Q12.
+    pub requant: Requant,
+    /// 513 entries.
+    pub tanh_table: &'a [i16],
+}
+
 /// One method per operator; see the module page. Operand layouts are those of [`crate::tensor`].
 pub trait Kernels {
     /// The kernels that this backend can read.
@@ -404,6 +415,11 @@ pub trait Kernels {
     fn gather_sum(&self, args: &GatherSumArgs<'_>, input: Codes<'_>, output: CodesMut<'_>) {
         portable::gather_sum::gather_sum(args, input, output);
     }
+
+    /// Logistic function of each element. `input` is `None` in place: then `output` holds the codes.
+    fn sigmoid(&self, args: &SigmoidArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
+        portable::sigmoid::sigmoid(args, input, output);
+    }
 }
 
 /// A borrowed backend is one: every method goes to the backend behind the reference.
@@ -489,6 +505,10 @@ impl<K: Kernels + ?Sized> Kernels for &K {
 
     fn gather_sum(&self, args: &GatherSumArgs<'_>, input: Codes<'_>, output: CodesMut<'_>) {
         (**self).gather_sum(args, input, output);
+    }
+
+    fn sigmoid(&self, args: &SigmoidArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
+        (**self).sigmoid(args, input, output);
     }
 }
 

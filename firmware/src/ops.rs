@@ -26,6 +26,7 @@ use crate::program::Step;
 mod add;
 mod attention;
 mod average_pool;
+mod branch_linear;
 mod concat;
 mod context;
 mod conv2d;
@@ -38,6 +39,7 @@ mod max_pool;
 mod requantize;
 mod rescale;
 mod resize_bilinear;
+mod sigmoid;
 mod softmax;
 mod term;
 mod tokens;
@@ -65,6 +67,8 @@ pub(crate) fn validate(step: &Step, context: &StepContext<'_, '_>) -> Result<u64
         Step::Concat(step) => concat::validate(step, context),
         Step::Softmax(step) => softmax::validate(step, context),
         Step::GatherSum(step) => gather_sum::validate(step, context),
+        Step::BranchLinear(step) => branch_linear::validate(step, context),
+        Step::Sigmoid(step) => sigmoid::validate(step, context),
     }
 }
 
@@ -97,6 +101,8 @@ pub(crate) fn run<K: Kernels>(
         Step::Concat(step) => concat::run(step, &context, kernels, operands),
         Step::Softmax(step) => softmax::run(step, &context, kernels, operands),
         Step::GatherSum(step) => gather_sum::run(step, &context, kernels, operands),
+        Step::BranchLinear(step) => branch_linear::run(step, &context, kernels, operands),
+        Step::Sigmoid(step) => sigmoid::run(step, &context, kernels, operands),
     }
 }
 

@@ -527,6 +527,49 @@ pub struct GatherSum {
     pub clamp: Clamp,
 }
 
+/// A [`Linear`] layer with B blocks of weights, of which a code selects one:
+/// `acc = bias + Σ w·q` with the rows of block `clamp(command − 1, 0, B − 1)`; see [`Rescale`] for what follows.
+///
+/// Arrays of `rescale` are per output channel of all blocks, `B·O`; it has no second term.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BranchLinear {
+    /// i8 or i16, `positions × I`.
+    pub input: TensorId,
+    /// i8, one code: 1 is the first block.
+    pub command: TensorId,
+    /// i8 or i16, `positions × O`.
+    pub output: TensorId,
+    /// B, at least 1.
+    pub branches: u16,
+    /// Packing of each block.
+    pub kernel: KernelId,
+    /// `i8` weights `[B][O][I]`, each block in the order of `kernel`.
+    pub weights: ConstRange,
+    /// Accumulate in 64 bits (the compiler's bound exceeds 31 bits).
+    pub wide: bool,
+    /// From accumulator to output code.
+    pub rescale: Rescale,
+    /// Working memory of the kernel.
+    pub scratch: Option<TensorId>,
+}
+
+/// Logistic function of each element: `x = R((q − z)·M, n)` (Q12, not clamped), `y = min(32767, R(2^15 + tanh(x/2), 1))`
+/// (Q15) with tanh from the table: `a = min(|x|, 2^16 − 1)`, `k = a>>7`, `r = a&127`,
+/// `tanh(x/2) = ±R(T[k]·128 + (T[k+1] − T[k])·r, 7)` with the sign of x.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Sigmoid {
+    /// i8 or i16.
+    pub input: TensorId,
+    /// i16, same shape, scale `2^-15`. May overwrite an i16 input.
+    pub output: TensorId,
+    /// `z`.
+    pub input_zero_point: i16,
+    /// M and n of `s_x·2^12`.
+    pub requant: Requant,
+    /// 513 × `i16`: `T[k] = min(32767, round(2^15·tanh(k/64)))`.
+    pub tanh_table: ConstRange,
+}
+
 /// One operator of the program, in the order of execution.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant, reason = "decoded one at a time on the stack, never stored in bulk on the target")]
@@ -548,6 +591,8 @@ pub enum Step {
     Concat(Concat),
     Softmax(Softmax),
     GatherSum(GatherSum),
+    BranchLinear(BranchLinear),
+    Sigmoid(Sigmoid),
 }
 
 impl Rescale {
@@ -562,7 +607,7 @@ impl Rescale {
 
 impl Step {
     /// Union of the feature bits of all step kinds and kernels of this format.
-    pub const KNOWN_FEATURES: u64 = ((1 << 16) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
+    pub const KNOWN_FEATURES: u64 = ((1 << 18) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
 
     /// Operator name as reports print it.
     pub const fn name(&self) -> &'static str {
@@ -583,6 +628,8 @@ impl Step {
             Self::Concat(_) => "concat",
             Self::Softmax(_) => "softmax",
             Self::GatherSum(_) => "gather_sum",
+            Self::BranchLinear(_) => "branch_linear",
+            Self::Sigmoid(_) => "sigmoid",
         }
     }
 
@@ -605,6 +652,8 @@ impl Step {
             Self::Concat(_) => 13,
             Self::Softmax(_) => 14,
             Self::GatherSum(_) => 15,
+            Self::BranchLinear(_) => 16,
+            Self::Sigmoid(_) => 17,
         }
     }
 
@@ -627,6 +676,8 @@ impl Step {
             Self::Concat(s) => s.output,
             Self::Softmax(s) => s.output,
             Self::GatherSum(s) => s.output,
+            Self::BranchLinear(s) => s.output,
+            Self::Sigmoid(s) => s.output,
         }
     }
 
@@ -637,6 +688,7 @@ impl Step {
             Self::Linear(s) => s.scratch,
             Self::Attention(s) => s.scratch,
             Self::WaypointDecoder(s) => s.scratch,
+            Self::BranchLinear(s) => s.scratch,
             _ => None,
         }
     }
@@ -646,6 +698,7 @@ impl Step {
         match self {
             Self::Conv2d(s) => Some(s.kernel),
             Self::Linear(s) => Some(s.kernel),
+            Self::BranchLinear(s) => Some(s.kernel),
             _ => None,
         }
     }
@@ -669,6 +722,8 @@ impl Step {
             Self::Concat(s) => [Some(s.first.tensor), Some(s.second.tensor), None],
             Self::Softmax(s) => [Some(s.input), None, None],
             Self::GatherSum(s) => [Some(s.input), Some(s.indices), None],
+            Self::BranchLinear(s) => [Some(s.input), Some(s.command), None],
+            Self::Sigmoid(s) => [Some(s.input), None, None],
         }
     }
 
@@ -683,6 +738,7 @@ impl Step {
             Self::ResizeBilinear(s) => [s.residual.map(|term| term.tensor), None],
             Self::Attention(s) => [Some(s.query), None],
             Self::Softmax(s) => [Some(s.input), None],
+            Self::Sigmoid(s) => [Some(s.input), None],
             _ => [None, None],
         }
     }

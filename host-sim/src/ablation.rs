@@ -3,6 +3,7 @@
 //! The f64 model stands for the engine, since their bytes are equal; nothing has to be compiled.
 
 use crate::classification::{ClassificationSummary, Comparison};
+use crate::controls::{ControlComparison, ControlError, ControlOutputs};
 use crate::files::FrameSource;
 use crate::statistics::{ErrorSums, Spread};
 use crate::trace::input_codes;
@@ -41,6 +42,9 @@ pub struct Fidelity {
     pub mean_mm: Vec<f64>,
     /// Largest distance, per waypoint, millimeters.
     pub worst_mm: Vec<f64>,
+    /// Of a network that gives controls: distance of each from the f32 network's.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub controls: Vec<ControlError>,
     /// Of a classifier: SQNR of the logits, agreement with f32, accuracy.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub classes: Option<ClassificationSummary>,
@@ -130,9 +134,18 @@ pub struct Bench<'a> {
     calibration: Vec<Vec<Vec<f32>>>,
     statistics: Statistics,
     evaluation: &'a [Frame],
-    /// Per frame: the pooled vector and the first output.
-    expected: Vec<[Vec<f32>; 2]>,
+    /// Per frame.
+    expected: Vec<Seen>,
     is_classifier: bool,
+    controls: Option<ControlOutputs>,
+}
+
+/// What one network gives for one frame.
+#[derive(Debug)]
+struct Seen {
+    /// The pooled vector.
+    vector: Vec<f32>,
+    outputs: Vec<Vec<f32>>,
 }
 
 impl<'a> Bench<'a> {
@@ -152,10 +165,11 @@ impl<'a> Bench<'a> {
                     seen = data.to_vec();
                 }
             })?;
-            expected.push([seen, outputs.into_iter().next().unwrap_or_default()]);
+            expected.push(Seen { vector: seen, outputs });
         }
+        let controls = ControlOutputs::find(graph.outputs.iter().map(|&id| graph.value(id).name.as_str()));
         let is_classifier = FrameFormat::of_graph(&graph).classes.is_some();
-        Ok(Self { graph, calibration, statistics, evaluation, expected, is_classifier })
+        Ok(Self { graph, calibration, statistics, evaluation, expected, is_classifier, controls })
     }
 
     /// Quantizes with these choices and evaluates. `progress` is called after each frame with the number done.
@@ -167,14 +181,19 @@ impl<'a> Bench<'a> {
         let mut vectors = ErrorSums::default();
         let mut distances = Vec::new();
         let mut classes = Comparison::default();
+        let mut controls = ControlComparison::default();
         for (index, (frame, expected)) in self.evaluation.iter().zip(&self.expected).enumerate() {
-            let [vector, output] = self.integers(&model, frame)?;
-            vectors.add(&expected[0], &vector);
+            let found = self.integers(&model, frame)?;
+            vectors.add(&expected.vector, &found.vector);
+            let predicted = |seen: &Seen| self.controls?.read(&seen.outputs);
+            let [output, expected_output] = [&found, expected].map(|seen| &seen.outputs[0]);
             if self.is_classifier {
-                classes.add(frame, &output, Some(&expected[1]));
+                classes.add(frame, output, Some(expected_output));
+            } else if let Some((found, expected)) = predicted(&found).zip(predicted(expected)) {
+                controls.add(&found, &expected);
             } else {
                 distances.resize(output.len() / 2, Spread::default());
-                let pairs = expected[1].chunks_exact(2).zip(output.chunks_exact(2));
+                let pairs = expected_output.chunks_exact(2).zip(output.chunks_exact(2));
                 for ((e, f), distance) in pairs.zip(&mut distances) {
                     distance.add(1e3 * f64::from(e[0] - f[0]).hypot(f64::from(e[1] - f[1])));
                 }
@@ -185,11 +204,12 @@ impl<'a> Bench<'a> {
             vector_sqnr_db: vectors.sqnr_db(),
             mean_mm: distances.iter().map(Spread::mean).collect(),
             worst_mm: distances.iter().map(Spread::max).collect(),
+            controls: controls.summary(),
             classes: classes.summary(),
         })
     }
 
-    fn integers(&self, model: &QModel, frame: &Frame) -> Result<[Vec<f32>; 2]> {
+    fn integers(&self, model: &QModel, frame: &Frame) -> Result<Seen> {
         let vector = vector_name(&self.graph)?;
         let inputs = input_codes(model, frame)?;
         let mut seen = Vec::new();
@@ -199,7 +219,8 @@ impl<'a> Bench<'a> {
                 seen = real(tensor, codes);
             }
         })?;
-        Ok([seen, real(model.tensor(model.outputs[0].tensor), &outputs[0])])
+        let outputs = model.outputs.iter().zip(&outputs).map(|(port, codes)| real(model.tensor(port.tensor), codes));
+        Ok(Seen { vector: seen, outputs: outputs.collect() })
     }
 }
 

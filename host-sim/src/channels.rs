@@ -16,7 +16,7 @@ pub struct Channels {
 }
 
 impl Channels {
-    /// The channels of a step without values yet; `None` where it has no weights per channel.
+    /// The channels of a step without values yet; `None` where it has no weights per channel, or several sets of them.
     ///
     /// The weight scale follows from the multiplier: `M·2^−(n+p) = s_x·s_w/s_o` (numerics, "Requantize").
     pub fn of(model: &QModel, op: &QOp) -> Option<Self> {

@@ -45,7 +45,9 @@ pub fn clip_range(tensor: &QTensor, op: &QOp) -> [f64; 2] {
 /// Clamp and zero point of an operator's output; `None` for copies, probabilities and waypoints.
 fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
     match op {
-        QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } => Some((rescale.clamp, rescale.zero_point)),
+        QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } | QOp::BranchLinear { rescale, .. } => {
+            Some((rescale.clamp, rescale.zero_point))
+        }
         QOp::AveragePool { clamp, zero_point, .. }
         | QOp::GlobalPool { clamp, zero_point, .. }
         | QOp::Add { clamp, zero_point, .. }
@@ -56,7 +58,11 @@ fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
         | QOp::Attention { clamp, zero_point, .. }
         | QOp::Concat { clamp, zero_point, .. }
         | QOp::GatherSum { clamp, zero_point, .. } => Some((*clamp, *zero_point)),
-        QOp::MaxPool { .. } | QOp::CopyBox { .. } | QOp::Softmax { .. } | QOp::WaypointDecoder(_) => None,
+        QOp::MaxPool { .. }
+        | QOp::CopyBox { .. }
+        | QOp::Softmax { .. }
+        | QOp::Sigmoid { .. }
+        | QOp::WaypointDecoder(_) => None,
     }
 }
 

@@ -49,9 +49,10 @@ pub struct StepChange {
 /// A figure of the whole.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FigureChange {
-    /// `arena`, `flash`, `pooled vector`, `output`, `worst step`, `waypoint K, mean`, `waypoint K, max`.
+    /// `arena`, `flash`, `pooled vector`, `output`, `worst step`, `waypoint K, mean`, `waypoint K, max`; for waypoint K
+    /// also `steer`, `throttle`, `brake`, `predicted_speed`.
     pub figure: String,
-    /// `B`, `dB` or `mm`.
+    /// `B`, `dB` or `mm`; empty for a control.
     pub unit: String,
     /// Before.
     pub before: Option<f64>,
@@ -146,6 +147,10 @@ fn figures(before: &VerifyReport, after: &VerifyReport) -> Vec<FigureChange> {
     for (k, (old, new)) in old.waypoint_error_mm.iter().zip(&new.waypoint_error_mm).enumerate() {
         figures.push(figure(&format!("waypoint {}, mean", k + 1), "mm", Some(old.mean), Some(new.mean)));
         figures.push(figure(&format!("waypoint {}, max", k + 1), "mm", Some(old.max), Some(new.max)));
+    }
+    for (old, new) in old.control_error.iter().zip(&new.control_error) {
+        figures.push(figure(&format!("{}, mean", new.name), "", Some(old.mean), Some(new.mean)));
+        figures.push(figure(&format!("{}, max", new.name), "", Some(old.max), Some(new.max)));
     }
     figures.retain(|figure| figure.before.is_some() && figure.after.is_some());
     figures

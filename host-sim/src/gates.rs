@@ -4,6 +4,7 @@
 //! min_sqnr_db = 15              # every step, accumulated
 //! min_output_sqnr_db = 18       # the first output
 //! max_waypoint_error_mm = 120   # every waypoint of every frame
+//! max_control_error = 0.02      # steer, throttle and brake of every frame, where the network gives them
 //! min_agreement_percent = 98.5  # of a classifier: frames on which int8 and f32 give one class
 //! min_top1_percent = 91         # of a classifier: frames on which the class is the label
 //! max_arena_bytes = 245760
@@ -37,6 +38,8 @@ pub struct Gates {
     pub min_output_sqnr_db: Option<f64>,
     /// Largest waypoint error of any frame, mm.
     pub max_waypoint_error_mm: Option<f64>,
+    /// Largest error of steer, throttle or brake of any frame.
+    pub max_control_error: Option<f64>,
     /// Fewest frames on which a classifier in int8 and in f32 gives one class, percent.
     pub min_agreement_percent: Option<f64>,
     /// Fewest frames on which the class is the label, percent.
@@ -115,6 +118,7 @@ struct File {
     min_sqnr_db: Option<Spanned<f64>>,
     min_output_sqnr_db: Option<Spanned<f64>>,
     max_waypoint_error_mm: Option<Spanned<f64>>,
+    max_control_error: Option<Spanned<f64>>,
     min_agreement_percent: Option<Spanned<f64>>,
     min_top1_percent: Option<Spanned<f64>>,
     max_arena_bytes: Option<u64>,
@@ -132,8 +136,8 @@ pub fn is_percentage(value: f64) -> bool {
     value > 1.0 && value <= 100.0
 }
 
-const FIELDS: &str = "fields: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm, min_agreement_percent, \
-                      min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, [steps] with \"PATTERN\" = dB";
+const FIELDS: &str = "fields: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm, max_control_error, \
+                      min_agreement_percent, min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, [steps] with \"PATTERN\" = dB";
 
 impl Gates {
     /// Reads a gate file.
@@ -184,6 +188,7 @@ impl Gates {
                 file.max_waypoint_error_mm,
                 "millimeters, 0 or more",
             )?,
+            max_control_error: distance("max_control_error", file.max_control_error, "an error, 0 or more")?,
             min_agreement_percent: share("min_agreement_percent", file.min_agreement_percent)?,
             min_top1_percent: share("min_top1_percent", file.min_top1_percent)?,
             max_arena_bytes: file.max_arena_bytes,
@@ -200,6 +205,7 @@ impl Gates {
             min_sqnr_db: self.min_sqnr_db.or(other.min_sqnr_db),
             min_output_sqnr_db: self.min_output_sqnr_db.or(other.min_output_sqnr_db),
             max_waypoint_error_mm: self.max_waypoint_error_mm.or(other.max_waypoint_error_mm),
+            max_control_error: self.max_control_error.or(other.max_control_error),
             min_agreement_percent: self.min_agreement_percent.or(other.min_agreement_percent),
             min_top1_percent: self.min_top1_percent.or(other.min_top1_percent),
             max_arena_bytes: self.max_arena_bytes.or(other.max_arena_bytes),
@@ -219,6 +225,7 @@ impl Gates {
             ("min_sqnr_db (--min-sqnr)", self.min_sqnr_db.is_some()),
             ("min_output_sqnr_db (--min-output-sqnr)", self.min_output_sqnr_db.is_some()),
             ("max_waypoint_error_mm", self.max_waypoint_error_mm.is_some()),
+            ("max_control_error", self.max_control_error.is_some()),
             ("min_agreement_percent (--min-agreement)", self.min_agreement_percent.is_some()),
             ("max_loss_db (--max-loss)", self.max_loss_db.is_some()),
             ("steps", !self.steps.is_empty()),
@@ -264,6 +271,12 @@ impl Gates {
             let place = largest.map(|(k, _)| format!("waypoint {}", k + 1));
             let found = largest.map(|(_, error)| error.max);
             outcomes.push(GateOutcome::at_most("max_waypoint_error_mm", place, found, limit, "mm"));
+        }
+        if let Some(limit) = self.max_control_error {
+            let controls = summary.control_error.iter().filter(|error| error.name != "predicted_speed");
+            let largest = controls.max_by(|a, b| a.max.total_cmp(&b.max));
+            let place = largest.map(|error| error.name.clone().into_owned());
+            outcomes.push(GateOutcome::at_most("max_control_error", place, largest.map(|e| e.max), limit, ""));
         }
         outcomes.extend(self.class_outcomes(summary.accuracy.as_ref())?);
         let sizes = [

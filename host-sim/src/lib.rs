@@ -3,7 +3,7 @@
 //! * [`backends`]: which of the firmware's kernels this machine can run
 //! * [`mod@bench`]: latency per step and whole, the backends side by side
 //! * [`demo`]: the whole way on the files of the source tree, without arguments
-//! * [`run`]: waypoints or classes of frames, int8 from an image or f32 from a checkpoint
+//! * [`run`]: waypoints, controls or classes of frames, int8 from an image or f32 from a checkpoint
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
 //!   f32 network: how much precision each step costs
 //! * [`attention`]: how often the fusing transformer looks from one sensor to the other, in integers and in f32
@@ -30,6 +30,7 @@ pub mod classification;
 pub mod cli;
 pub mod codes;
 pub mod compare;
+pub mod controls;
 pub mod demo;
 pub mod diff;
 pub mod files;

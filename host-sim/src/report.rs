@@ -12,6 +12,7 @@ use crate::attention::Measured;
 use crate::channels::Channels;
 use crate::classification::{ClassificationSummary, ClassifiedFrame};
 use crate::compare::StepDifference;
+use crate::controls::{ControlError, ControlPrediction};
 use crate::diff::Diff;
 use crate::gates::GateOutcome;
 use crate::histogram::Histogram;
@@ -28,6 +29,7 @@ use std::borrow::Cow;
 use std::path::Path;
 
 mod classes;
+mod controls;
 mod figures;
 pub mod html;
 pub mod json;
@@ -102,6 +104,9 @@ pub struct Summary {
     pub output_sqnr_db: Option<f64>,
     /// Distance of waypoint k from the f32 network's.
     pub waypoint_error_mm: Vec<WaypointError>,
+    /// Of a network that gives controls: distance of each from the f32 network's.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub control_error: Vec<ControlError>,
     /// Size of the arena, bytes.
     pub arena_bytes: u64,
     /// Its lower bound, bytes.
@@ -199,6 +204,12 @@ pub struct FrameReport {
     pub waypoints: Option<Waypoints>,
     /// Of the f32 network.
     pub reference_waypoints: Option<Waypoints>,
+    /// What a network that gives controls says.
+    #[serde(flatten)]
+    pub control: Option<ControlPrediction>,
+    /// The same of the f32 network.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub reference_control: Option<ControlPrediction>,
     /// What a classifier says.
     #[serde(flatten)]
     pub classes: Option<ClassifiedFrame>,
@@ -228,9 +239,17 @@ impl StepReport {
 }
 
 impl FrameReport {
-    /// How bad the frame is, for sorting: the largest waypoint error in mm, else the noise of the output.
+    /// How far the controls are from those of the f32 network, by name; empty where one is missing.
+    pub fn control_errors(&self) -> Vec<(&'static str, f64)> {
+        let Some((found, expected)) = self.control.as_ref().zip(self.reference_control.as_ref()) else { return vec![] };
+        found.values().zip(expected.values()).map(|((name, f), (_, e))| (name, (f - e).abs())).collect()
+    }
+
+    /// How bad the frame is, for sorting: the largest waypoint error in mm or error of a control, else the noise of the
+    /// output.
     pub fn badness(&self) -> f64 {
-        let largest = self.waypoint_error_mm.iter().copied().reduce(f64::max);
+        let controls = self.control_errors().into_iter().map(|(_, error)| error);
+        let largest = self.waypoint_error_mm.iter().copied().chain(controls).reduce(f64::max);
         largest.or(self.output_sqnr_db.map(|db| -db)).unwrap_or(f64::NEG_INFINITY)
     }
 }
@@ -325,6 +344,7 @@ pub(crate) mod tests {
                 output_step: Some("conv1".into()),
                 output_sqnr_db: Some(21.5),
                 waypoint_error_mm: vec![WaypointError { mean: 1.25, max: 2.5 }],
+                control_error: vec![],
                 arena_bytes: 2048,
                 arena_bound_bytes: 2048,
                 arena_status: PlanStatus::Optimal,
@@ -346,6 +366,8 @@ pub(crate) mod tests {
                 output_sqnr_db: Some(21.5),
                 waypoints: Some(vec![[0.0, 1.0]]),
                 reference_waypoints: Some(vec![[0.0, 1.001]]),
+                control: None,
+                reference_control: None,
                 classes: None,
                 waypoint_error_mm: vec![1.0],
             }],

@@ -1,9 +1,10 @@
-//! Waypoints or classes of frames: int8 from an image, f32 from a checkpoint.
+//! Waypoints, controls or classes of frames: int8 from an image, f32 from a checkpoint.
 
 use crate::backends::Backend;
 use crate::buffers::GuardedArena;
 use crate::classification::{Accuracy, Classification};
 use crate::codes::decode;
+use crate::controls::{ControlOutputs, ControlPrediction};
 use crate::files::{self, FrameSource, ImageFile};
 use firmware::engine::{Engine, EngineError};
 use firmware::image::{Image, Port, TensorRecord};
@@ -53,6 +54,8 @@ pub enum Output {
         /// Where to drive.
         waypoints: Waypoints,
     },
+    /// Of a driving network that gives controls.
+    Controls(ControlPrediction),
     /// Of a classifier.
     Class(Classification),
 }
@@ -79,7 +82,7 @@ impl RunReport {
     pub fn new(model: ModelInfo, frames: Vec<FrameResult>) -> Self {
         let classes = frames.iter().filter_map(|frame| match &frame.output {
             Output::Class(classification) => Some(classification),
-            Output::Waypoints { .. } => None,
+            Output::Waypoints { .. } | Output::Controls(_) => None,
         });
         let accuracy = Accuracy::of(classes);
         Self { schema: 1, model, frames, accuracy, class_names: BTreeMap::new() }
@@ -95,7 +98,7 @@ impl RunReport {
 /// Runs a model image (int8, on the firmware's engine) or a checkpoint (f32) over frames.
 ///
 /// # Errors
-/// The model or a frame cannot be read, or the network gives neither waypoints nor classes.
+/// The model or a frame cannot be read, or the network gives neither waypoints nor controls nor classes.
 pub fn run(
     model: &Path,
     import: &ImportOptions,
@@ -116,12 +119,12 @@ fn run_image(file: &ImageFile, source: &FrameSource, backend: Backend, progress:
     let image = file.parse()?;
     let format = files::frame_format(&image)?;
     let mut device = Device::new(image, backend)?;
-    let kind = match device.record.element == ElementType::I32 && device.record.shape.channels == 2 {
-        true => OutputKind::Waypoints,
-        false => OutputKind::of_classifier(&format, image.name())?,
-    };
+    let (_, record) = device.outputs[0];
+    let gives_waypoints = record.element == ElementType::I32 && record.shape.channels == 2;
+    let names = device.outputs.iter().map(|(port, _)| port.name);
+    let kind = OutputKind::of(gives_waypoints, names, &format, image.name())?;
     let frames = source.load(&format)?;
-    let results = each_frame(&frames, progress, |frame| Ok(kind.read(device.infer(frame)?, frame)))?;
+    let results = each_frame(&frames, progress, |frame| kind.read(device.infer(frame)?, frame))?;
     let model = ModelInfo { name: image.name().to_owned(), sha256: artifact::hex(&file.sha256()) };
     Ok(RunReport::new(model, results).with_names(&frames))
 }
@@ -129,15 +132,14 @@ fn run_image(file: &ImageFile, source: &FrameSource, backend: Backend, progress:
 fn run_graph(graph: &Graph, model: ModelInfo, source: &FrameSource, progress: &ProgressBar) -> Result<RunReport> {
     let format = FrameFormat::of_graph(graph);
     let gives_waypoints = graph.outputs.first().and_then(|&id| graph.producer(id));
-    let kind = match gives_waypoints.is_some_and(|node| matches!(node.op, Op::WaypointDecoder(_))) {
-        true => OutputKind::Waypoints,
-        false => OutputKind::of_classifier(&format, &graph.name)?,
-    };
+    let gives_waypoints = gives_waypoints.is_some_and(|node| matches!(node.op, Op::WaypointDecoder(_)));
+    let names = graph.outputs.iter().map(|&id| graph.value(id).name.as_str());
+    let kind = OutputKind::of(gives_waypoints, names, &format, &graph.name)?;
     let frames = source.load(&format)?;
     let results = each_frame(&frames, progress, |frame| {
         let inputs: Vec<Vec<f32>> = graph.inputs().map(|(_, kind)| frame.raw(kind)).collect::<Result<_>>()?;
-        let output = reference::run(graph, &inputs, |_, _| ())?.swap_remove(0);
-        Ok(kind.read(output.into_iter().map(f64::from).collect(), frame))
+        let outputs = reference::run(graph, &inputs, |_, _| ())?;
+        kind.read(outputs.into_iter().map(|output| output.into_iter().map(f64::from).collect()).collect(), frame)
     })?;
     Ok(RunReport::new(model, results).with_names(&frames))
 }
@@ -157,26 +159,40 @@ fn each_frame(
     frames.iter().map(&mut result).collect()
 }
 
-/// How the first output is to be read.
+/// How the outputs are to be read.
 #[derive(Clone, Copy)]
 enum OutputKind {
     Waypoints,
+    Controls(ControlOutputs),
     Classes,
 }
 
 impl OutputKind {
-    fn of_classifier(format: &FrameFormat, name: &str) -> Result<Self> {
-        format.classes.map(|_| Self::Classes).ok_or_else(|| {
-            let message = "its first output holds neither waypoints nor classes";
-            Error::new(ErrorCode::Unsupported, format!("network {name}"), message)
+    fn of<'n>(
+        gives_waypoints: bool,
+        outputs: impl Iterator<Item = &'n str>,
+        format: &FrameFormat,
+        network: &str,
+    ) -> Result<Self> {
+        if gives_waypoints {
+            return Ok(Self::Waypoints);
+        }
+        let controls = ControlOutputs::find(outputs).map(Self::Controls);
+        controls.or(format.classes.map(|_| Self::Classes)).ok_or_else(|| {
+            let message = "its first output holds neither waypoints nor controls nor classes";
+            Error::new(ErrorCode::Unsupported, format!("network {network}"), message)
         })
     }
 
-    fn read(self, values: Vec<f64>, frame: &Frame) -> Output {
-        match self {
-            Self::Waypoints => Output::Waypoints { waypoints: waypoints(&values) },
-            Self::Classes => Output::Class(Classification::new(values, frame)),
-        }
+    /// Reads the real values of all outputs.
+    fn read(self, mut outputs: Vec<Vec<f64>>, frame: &Frame) -> Result<Output> {
+        Ok(match self {
+            Self::Waypoints => Output::Waypoints { waypoints: waypoints(&outputs[0]) },
+            Self::Controls(controls) => Output::Controls(controls.read(&outputs).ok_or_else(|| {
+                Error::new(ErrorCode::Unsupported, "output `controls`", "expected steer, throttle and brake")
+            })?),
+            Self::Classes => Output::Class(Classification::new(outputs.swap_remove(0), frame)),
+        })
     }
 }
 
@@ -185,27 +201,28 @@ pub fn waypoints<T: Copy + Into<f64>>(values: &[T]) -> Waypoints {
     values.as_chunks::<2>().0.iter().map(|&[right, y]| [right.into(), 0.0 - y.into()]).collect()
 }
 
-/// An image with its working memory and its first output.
+/// An image with its working memory and its outputs, one at least.
 pub(crate) struct Device<'a> {
     image: Image<'a>,
     backend: Backend,
     arena: GuardedArena,
-    port: Port<'a>,
-    record: TensorRecord,
+    outputs: Vec<(Port<'a>, TensorRecord)>,
 }
 
 impl<'a> Device<'a> {
     pub(crate) fn new(image: Image<'a>, backend: Backend) -> Result<Self> {
-        let port = image.output(0).and_then(|port| Some((port, image.tensor(port.tensor)?)));
-        let (port, record) = port.ok_or_else(|| {
-            Error::new(ErrorCode::Unsupported, format!("network {}", image.name()), "it has no output")
-        })?;
+        let output = |i| image.output(i).and_then(|port| Some((port, image.tensor(port.tensor)?)));
+        let outputs: Vec<_> = (0..image.output_count()).filter_map(output).collect();
+        if outputs.is_empty() {
+            let place = format!("network {}", image.name());
+            return Err(Error::new(ErrorCode::Unsupported, place, "it has no output"));
+        }
         let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
-        Ok(Self { image, backend, arena, port, record })
+        Ok(Self { image, backend, arena, outputs })
     }
 
-    /// Real values of the first output.
-    fn infer(&mut self, frame: &Frame) -> Result<Vec<f64>> {
+    /// Real values of the outputs.
+    fn infer(&mut self, frame: &Frame) -> Result<Vec<Vec<f64>>> {
         self.infer_observed(frame, |_, _, _| ())
     }
 
@@ -214,15 +231,18 @@ impl<'a> Device<'a> {
         &mut self,
         frame: &Frame,
         observe: impl FnMut(usize, &Step, &[u8]),
-    ) -> Result<Vec<f64>> {
+    ) -> Result<Vec<Vec<f64>>> {
         let inputs = self.input_bytes(frame)?;
         let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
         let refuse = |e: EngineError| Error::new(ErrorCode::Malformed, "engine", e.to_string());
         let mut engine = Engine::new(self.image, self.backend.kernels(), self.arena.poisoned(0)).map_err(refuse)?;
         engine.infer_observed(&inputs, observe).map_err(refuse)?;
-        let codes = decode(engine.output(0).map_err(refuse)?, self.record.element);
-        let real = |&code: &i32| (f64::from(code) - f64::from(self.port.zero_point)) * f64::from(self.port.scale);
-        Ok(codes.iter().map(real).collect())
+        let real = |(index, (port, record)): (usize, &(Port<'_>, TensorRecord))| {
+            let codes = decode(engine.output(index).map_err(refuse)?, record.element);
+            let real = |&code: &i32| (f64::from(code) - f64::from(port.zero_point)) * f64::from(port.scale);
+            Ok(codes.iter().map(real).collect())
+        };
+        self.outputs.iter().enumerate().map(real).collect()
     }
 
     fn input_bytes(&self, frame: &Frame) -> Result<Vec<Vec<u8>>> {

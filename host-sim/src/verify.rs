@@ -4,6 +4,7 @@ use crate::backends::Backend;
 use crate::channels::Channels;
 use crate::classification::Comparison;
 use crate::codes;
+use crate::controls::{ControlComparison, ControlOutputs};
 use crate::diff::Diff;
 use crate::files::{self, FrameSource, ImageFile};
 use crate::gates::Gates;
@@ -126,6 +127,7 @@ fn compare_and_measure(
     let mut waypoint_errors = Vec::new();
     let is_classifier = FrameFormat::of_model(&record.model).classes.is_some();
     let mut classes = Comparison::default();
+    let mut controls = ControlComparison::default();
     let mut first_difference = None;
     let mut frame_reports = Vec::new();
     for frame in frames {
@@ -137,6 +139,9 @@ fn compare_and_measure(
             report.classes = Some(classes.add(frame, &trace.outputs[0], reference));
         }
         add_waypoint_errors(&mut waypoint_errors, &report);
+        if let (Some(found), Some(expected)) = (&report.control, &report.reference_control) {
+            controls.add(found, expected);
+        }
         frame_reports.push(report);
         first_difference = trace.difference;
         if first_difference.is_some() {
@@ -151,7 +156,11 @@ fn compare_and_measure(
         _ => None,
     };
     let steps = step_reports(record, tracer.figures());
-    let summary = Summary { accuracy: classes.summary(), ..summary(record, &steps, &waypoint_errors) };
+    let summary = Summary {
+        accuracy: classes.summary(),
+        control_error: controls.summary(),
+        ..summary(record, &steps, &waypoint_errors)
+    };
     Ok(VerifyReport {
         schema: json::SCHEMA,
         model,
@@ -188,6 +197,7 @@ fn frame_report(record: &Record, frame: &Frame, trace: &FrameTrace, calibration:
     let reference = trace.reference_outputs.as_ref();
     let found = output.map(|i| waypoints(&trace.outputs[i]));
     let expected = output.and_then(|i| Some(waypoints(&reference?[i])));
+    let controls = ControlOutputs::find(model.outputs.iter().map(|port| port.name.as_str()));
     let decibels = |position: Option<usize>| Some(trace.accumulated.get(position?)?.sqnr_db());
     let rank = |sums: &ErrorSums| Some(sums.sqnr_db()).filter(|db| !db.is_nan()).unwrap_or(f64::NEG_INFINITY);
     let worst = (0..trace.accumulated.len())
@@ -204,6 +214,8 @@ fn frame_report(record: &Record, frame: &Frame, trace: &FrameTrace, calibration:
         waypoint_error_mm: found.as_ref().zip(expected.as_ref()).map(|(f, e)| distances_mm(f, e)).unwrap_or_default(),
         waypoints: found,
         reference_waypoints: expected,
+        control: controls.and_then(|controls| controls.read(&trace.outputs)),
+        reference_control: controls.and_then(|controls| controls.read(reference?)),
         classes: None,
     }
 }
@@ -275,6 +287,7 @@ fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread]) ->
         output_step: output.map(|step| step.step.clone()),
         output_sqnr_db: output.and_then(|step| step.sqnr_db),
         waypoint_error_mm: waypoint_errors.iter().map(|s| WaypointError { mean: s.mean(), max: s.max() }).collect(),
+        control_error: Vec::new(),
         arena_bytes: plan.arena_bytes,
         arena_bound_bytes: plan.bound_bytes,
         arena_status: plan.status,

@@ -6,7 +6,7 @@
 
 use crate::error::{Error, ErrorCode, Result};
 use crate::ir::{Graph, ValueId};
-use crate::reference;
+use crate::reference::{self, Branches};
 use rayon::prelude::*;
 
 const BINS: usize = 4096;
@@ -23,7 +23,7 @@ pub struct ValueStatistics {
     pub max: f64,
     /// Elements seen.
     pub count: u64,
-    /// Mean per channel.
+    /// Mean per channel; of a value behind a command for one branch after the other.
     pub channel_mean: Vec<f64>,
     /// Equal bins over `[min, max]`; exact zeros are left out, since they quantize without error at any scale.
     pub histogram: Vec<u64>,
@@ -48,14 +48,15 @@ impl ValueStatistics {
         (((x - self.min) / span * BINS as f64) as usize).min(BINS - 1)
     }
 
-    fn see_extremes(&mut self, data: &[f32], channels: usize) {
+    /// One of `forms` forms of a value.
+    fn see_extremes(&mut self, data: &[f32], channels: usize, form: usize, forms: usize) {
         if self.count == 0 {
             (self.min, self.max) = (f64::INFINITY, f64::NEG_INFINITY);
-            self.channel_mean = vec![0.0; channels];
+            self.channel_mean = vec![0.0; forms * channels];
         }
         self.count += data.len() as u64;
         for position in data.chunks_exact(channels) {
-            for (&x, sum) in position.iter().zip(&mut self.channel_mean) {
+            for (&x, sum) in position.iter().zip(&mut self.channel_mean[form * channels..]) {
                 let x = f64::from(x);
                 self.min = self.min.min(x);
                 self.max = self.max.max(x);
@@ -75,8 +76,8 @@ impl ValueStatistics {
         }
     }
 
-    fn finish_extremes(&mut self, channels: usize) {
-        let per_channel = (self.count as f64 / channels as f64).max(1.0);
+    fn finish_extremes(&mut self) {
+        let per_channel = (self.count as f64 / self.channel_mean.len() as f64).max(1.0);
         for mean in &mut self.channel_mean {
             *mean /= per_channel;
         }
@@ -105,7 +106,8 @@ impl Statistics {
     }
 }
 
-/// Runs the reference over the frames: per frame, raw inputs in the order of [`Graph::inputs`].
+/// Runs the reference over the frames: per frame, raw inputs in the order of [`Graph::inputs`]. What a command selects
+/// is run for every command, whichever the frame holds: a branch that no frame selects is calibrated like any other.
 /// `progress` is called after each frame of each pass with the number done and the total.
 ///
 /// # Errors
@@ -122,14 +124,15 @@ pub fn calibrate(
     let total = 2 * frames.len();
     let mut values = vec![ValueStatistics::default(); graph.values.len()];
     let channels = |id: ValueId| usize::from(graph.value(id).shape.channels);
+    let branches = Branches::of(graph);
     let extremes = |i: usize, frame: &Vec<Vec<f32>>| {
         let mut of_frame = vec![ValueStatistics::default(); graph.values.len()];
         let mut broken = None;
-        reference::run(graph, frame, |node, data| {
+        reference::run_branches(graph, &branches, frame, |id, branch, data| {
             if broken.is_none() && data.iter().any(|x| !x.is_finite()) {
-                broken = Some(node.name.clone());
+                broken = Some(graph.value(id).name.clone());
             }
-            of_frame[node.output.0 as usize].see_extremes(data, channels(node.output));
+            of_frame[id.0 as usize].see_extremes(data, channels(id), branch, branches.forms(id));
         })?;
         match broken {
             None => Ok(of_frame),
@@ -145,14 +148,12 @@ pub fn calibrate(
         values.iter_mut().zip(&of_frame).for_each(|(value, of_frame)| value.add_extremes(of_frame));
         progress(done, total);
     })?;
-    for (index, value) in values.iter_mut().enumerate() {
-        value.finish_extremes(channels(ValueId(index as u32)));
-    }
+    values.iter_mut().for_each(ValueStatistics::finish_extremes);
     let mut histograms = vec![vec![0; BINS]; values.len()];
     let distributions = |_: usize, frame: &Vec<Vec<f32>>| {
         let mut of_frame = Vec::with_capacity(values.len());
-        reference::run(graph, frame, |node, data| {
-            let index = node.output.0 as usize;
+        reference::run_branches(graph, &branches, frame, |id, _, data| {
+            let index = id.0 as usize;
             of_frame.push((index, values[index].distribution(data)));
         })?;
         Ok(of_frame)
@@ -188,7 +189,7 @@ fn add(sums: &mut [f64], others: &[f64]) {
     sums.iter_mut().zip(others).for_each(|(sum, other)| *sum += other);
 }
 
-/// Mean per channel of the values that quantized activations stand for: what clipping and rounding leave of each mean.
+/// Mean per channel, and per branch behind a command, of the values that quantized activations stand for: what clipping and rounding leave of each mean.
 /// `rounded` gives the nearest representable value; `None` leaves a value's float mean. `progress` is called after each
 /// frame with the number done and the total.
 ///
@@ -206,25 +207,26 @@ pub fn quantized_means(
     for (mean, _) in means.iter_mut().zip(&is_rounded).filter(|(_, rounded)| **rounded) {
         mean.fill(0.0);
     }
+    let branches = Branches::of(graph);
     let sums = |_: usize, frame: &Vec<Vec<f32>>| {
         let mut of_frame = Vec::new();
-        reference::run(graph, frame, |node, data| {
-            let index = node.output.0 as usize;
+        reference::run_branches(graph, &branches, frame, |id, branch, data| {
+            let index = id.0 as usize;
             if !is_rounded[index] {
                 return;
             }
-            let mut sums = vec![0.0; statistics.values[index].channel_mean.len()];
+            let mut sums = vec![0.0; usize::from(graph.value(id).shape.channels)];
             for position in data.chunks_exact(sums.len()) {
                 for (&x, sum) in position.iter().zip(sums.iter_mut()) {
-                    *sum += rounded(node.output, f64::from(x)).unwrap_or(0.0);
+                    *sum += rounded(id, f64::from(x)).unwrap_or(0.0);
                 }
             }
-            of_frame.push((index, sums));
+            of_frame.push((index, branch * sums.len(), sums));
         })?;
         Ok(of_frame)
     };
     in_order(frames, sums, |done, of_frame| {
-        of_frame.iter().for_each(|(index, sums)| add(&mut means[*index], sums));
+        of_frame.iter().for_each(|(index, first, sums)| add(&mut means[*index][*first..], sums));
         progress(done, frames.len());
     })?;
     for (index, mean) in means.iter_mut().enumerate().filter(|(index, _)| is_rounded[*index]) {
@@ -232,6 +234,15 @@ pub fn quantized_means(
         mean.iter_mut().for_each(|m| *m /= per_channel);
     }
     Ok(means)
+}
+
+/// The means of one branch, or, where none is selected, over all of them: `means` per channel or per branch and channel.
+pub fn branch_means(means: &[f64], channels: usize, branch: Option<usize>) -> Vec<f64> {
+    let forms = means.len() / channels;
+    match branch {
+        Some(branch) => means[branch.min(forms - 1) * channels..][..channels].to_vec(),
+        None => (0..channels).map(|c| means[c..].iter().step_by(channels).sum::<f64>() / forms as f64).collect(),
+    }
 }
 
 #[cfg(test)]

@@ -44,6 +44,8 @@ pub struct FrameFormat {
     pub goal: bool,
     /// Cells that see the same points, of the LiDAR map and of the image map: `H×W×2K`.
     pub points: Option<Shape>,
+    /// Navigation command.
+    pub command: bool,
     /// Height that separates the two histogram channels: meters, relative to a sensor 2.5 m above ground.
     pub split_height_m: f64,
 }
@@ -60,6 +62,7 @@ impl FrameFormat {
             velocity: false,
             goal: false,
             points: None,
+            command: false,
             split_height_m: split_height_m(system),
         };
         for (kind, shape) in inputs {
@@ -69,6 +72,7 @@ impl FrameFormat {
                 InputKind::Velocity => format.velocity = true,
                 InputKind::Goal => format.goal = true,
                 InputKind::BevPoints | InputKind::CameraPoints => format.points = Some(shape),
+                InputKind::Command => format.command = true,
             }
         }
         format
@@ -77,7 +81,7 @@ impl FrameFormat {
     /// The same, of a classifier if there is nothing but one image to read and the first output is a vector.
     #[must_use]
     pub fn with_output(mut self, image_name: &str, output: Option<Shape>) -> Self {
-        let others = self.bev.is_some() || self.velocity || self.goal || self.points.is_some();
+        let others = self.bev.is_some() || self.velocity || self.goal || self.command || self.points.is_some();
         let is_only_input = self.image.is_some() && !others;
         self.classes = output.filter(|s| is_only_input && (s.height, s.width) == (1, 1)).map(|s| s.channels);
         if self.classes.is_some() {
@@ -132,7 +136,7 @@ pub struct Frame {
     pub velocity: Option<f64>,
     /// Goal `[right, forward-negative]`, m.
     pub goal: Option<[f64; 2]>,
-    /// Navigation command 1..=6; no network input here.
+    /// Navigation command 1..=6: left, right, straight, lane follow, change left, change right.
     pub command: Option<u8>,
     /// Cells of the camera image for each cell of the LiDAR map ([`correspondence`]).
     pub bev_points: Option<ByteMap>,
@@ -145,7 +149,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The values of one network input in raw units: grey levels, counts, m/s, m, numbers of cells.
+    /// The values of one network input in raw units: grey levels, counts, m/s, m, a command's number, numbers of cells.
     ///
     /// # Errors
     /// The frame does not hold this input.
@@ -158,6 +162,7 @@ impl Frame {
             InputKind::Goal => self.goal.map(|g| g.map(|v| v as f32).to_vec()),
             InputKind::BevPoints => self.bev_points.as_ref().map(bytes),
             InputKind::CameraPoints => self.camera_points.as_ref().map(bytes),
+            InputKind::Command => self.command.map(|c| vec![f32::from(c)]),
         };
         values.ok_or_else(|| {
             Error::new(
@@ -183,7 +188,8 @@ impl Frame {
         }
     }
 
-    /// SHA-256 over everything that a network reads of this frame. The name does not count.
+    /// SHA-256 over everything that a network reads of this frame. The name does not count, nor the command: the
+    /// calibration runs a frame under every command.
     pub fn digest(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
         for kind in INPUT_KINDS {
@@ -220,6 +226,7 @@ pub fn input_name(kind: InputKind) -> &'static str {
         InputKind::Goal => "goal",
         InputKind::BevPoints => "bev_points",
         InputKind::CameraPoints => "cam_points",
+        InputKind::Command => "command",
     }
 }
 
@@ -323,7 +330,8 @@ mod tests {
         let bev = Shape::map(256, 256, 2);
         let late = FrameFormat::new("late_fusion", [(InputKind::Bev, bev), (InputKind::Goal, Shape::vector(2))]);
         assert_eq!(late.bev, Some(bev));
-        assert!(late.goal && !late.velocity && late.image.is_none());
+        assert!(late.goal && !late.velocity && !late.command && late.image.is_none());
+        assert!(FrameFormat::new("cilrs", [(InputKind::Command, Shape::vector(1))]).command);
         assert_eq!(late.split_height_m, 2.0);
         assert_eq!(FrameFormat::new("transfuser", []).split_height_m, -2.0);
     }
@@ -338,6 +346,8 @@ mod tests {
         assert_eq!(classes(&[camera], Some(Shape::vector(10))), Some(10));
         assert_eq!(classes(&[camera], Some(Shape::map(4, 1, 2))), None, "waypoints");
         assert_eq!(classes(&[camera, goal], Some(Shape::vector(10))), None);
+        let command = (InputKind::Command, Shape::vector(1));
+        assert_eq!(classes(&[camera, command], Some(Shape::vector(3))), None, "controls");
         assert_eq!(classes(&[camera], None), None);
     }
 }

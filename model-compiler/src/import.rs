@@ -120,7 +120,7 @@ pub enum System {
     TransFuser,
     /// Image and LiDAR, fused by sums over cells that see the same points at up to four scales, waypoints.
     GeometricFusion,
-    /// Conditional imitation learning; recognized, not supported.
+    /// Image (ResNet-18), speed and command, controls.
     Cilrs,
     /// Learning by cheating; recognized, not supported.
     Lbc,
@@ -200,8 +200,9 @@ pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
 
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
 ///
-/// Inputs are `rgb`, `bev`, `velocity`, `bev_points`, `cam_points` and `goal`, as far as the system has them, in raw units; the output is
-/// `waypoints`. Values carry the names of the checkpoint's modules.
+/// Inputs are `rgb`, `bev`, `velocity`, `command`, `bev_points`, `cam_points` and `goal`, as far as the system has them, in
+/// raw units; the output is `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake) and
+/// `predicted_speed` (m/s). Values carry the names of the checkpoint's modules.
 ///
 /// # Errors
 /// `Unsupported`: no known system, one that is not supported, or sizes that do not fit together. `Tensors`: the list
@@ -220,7 +221,7 @@ fn unrecognized(tensors: &NamedTensors) -> Error {
         format!("the tensor names are of no known system ({} tensors: {}, …)", tensors.len(), first.join(", "))
     };
     Error::new(ErrorCode::Unsupported, "", message).with_help(
-        "supported are checkpoints of aim, late_fusion, transfuser and geometric_fusion (2021); --system names one",
+        "supported are checkpoints of aim, late_fusion, transfuser, geometric_fusion and cilrs (2021); --system names one",
     )
 }
 
@@ -257,7 +258,7 @@ mod tests {
 
     #[test]
     fn systems_that_come_later_are_refused_by_name() {
-        for system in [System::Cilrs, System::Lbc] {
+        for system in [System::Lbc] {
             let options = ImportOptions { system: Some(system), ..Default::default() };
             let error = import("file.pth", names(&["x"]), &options).unwrap_err();
             assert_eq!(error.code, ErrorCode::Unsupported);
@@ -272,8 +273,7 @@ mod tests {
         assert_eq!(
             error.to_string(),
             "m.pth: the tensor names are of no known system (2 tensors: fc.bias, fc.weight, …)\n  \
-             help: supported are checkpoints of aim, late_fusion, transfuser and geometric_fusion (2021); --system \
-             names one"
+             help: supported are checkpoints of aim, late_fusion, transfuser, geometric_fusion and cilrs (2021); --system names one"
         );
     }
 

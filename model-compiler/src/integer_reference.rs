@@ -14,8 +14,10 @@
 
 mod arithmetic;
 mod attention;
+mod branch_linear;
 mod concat;
 mod copy_box;
+mod gates;
 mod gather_sum;
 mod inputs;
 mod layer_norm;
@@ -23,6 +25,7 @@ mod operands;
 mod pool;
 mod rescale;
 mod resize_bilinear;
+mod sigmoid;
 mod softmax;
 mod sum;
 #[cfg(test)]
@@ -172,6 +175,13 @@ fn dispatch(operands: &Operands, op: &QOp) -> Result<Vec<f64>> {
             let term = QTerm { tensor: *input, zero_point: *input_zero_point, multiplier: requant.multiplier };
             let requantizer = Requantizer::new(requant.shift, *zero_point, *clamp);
             gather_sum::gather_sum(operands, term, *indices, *output, &requantizer)
+        }
+        QOp::BranchLinear { input, command, output, branches, weights, wide: _, rescale } => {
+            branch_linear::branch_linear(operands, *input, *command, *output, *branches, weights, rescale)
+        }
+        QOp::Sigmoid { input, output, input_zero_point, requant, tanh_table } => {
+            let term = QTerm { tensor: *input, zero_point: *input_zero_point, multiplier: requant.multiplier };
+            sigmoid::sigmoid(operands, term, requant.shift, *output, tanh_table)
         }
     }
 }

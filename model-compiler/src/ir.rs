@@ -56,6 +56,8 @@ pub enum InputKind {
     BevPoints,
     /// For each cell of the image map, cells of the LiDAR map: `H×W×2K`, a row and a column each, from 0.
     CameraPoints,
+    /// Navigation command, one number from 1 on: it selects a branch.
+    Command,
 }
 
 /// Bounds of a result: `min(max(x, min), max)`. ReLU is `0..∞`, ReLU6 `0..6`.
@@ -115,6 +117,29 @@ pub struct Linear {
     pub bias: Option<Arc<Vec<f32>>>,
     /// Bounds at the end (after the residual, if there is one).
     pub clip: Clip,
+}
+
+/// One of several linear layers of the same size, selected by a command: `clamp(command − 1, 0, branches − 1)`.
+#[derive(Clone, Debug)]
+pub struct BranchLinear {
+    /// `[branch][output][input]`.
+    pub weights: Arc<Weights>,
+    /// `[branch][output]`.
+    pub bias: Option<Arc<Vec<f32>>>,
+    /// Bounds at the end.
+    pub clip: Clip,
+}
+
+impl BranchLinear {
+    /// Number of branches.
+    pub fn branches(&self) -> usize {
+        self.weights.shape.first().copied().unwrap_or(0)
+    }
+
+    /// The branch that a command selects.
+    pub fn branch(&self, command: f32) -> usize {
+        ((command - 1.0).max(0.0) as usize).min(self.branches().saturating_sub(1))
+    }
 }
 
 /// Inference batch norm: `(x − mean)·weight/√(var + eps) + bias`.
@@ -255,6 +280,10 @@ pub enum Op {
     /// `[map, indices]`: `out[i,j] = Σ_k map[p_ijk]`, where the cell p is the row `indices[i,j,2k]` and the column
     /// `indices[i,j,2k+1]`; one outside the map means the nearest row or column.
     GatherSum,
+    /// `[x, command]`.
+    BranchLinear(BranchLinear),
+    /// `[x]`: `1 / (1 + exp(−x))` of each element.
+    Sigmoid,
 }
 
 /// One operator application.
@@ -363,6 +392,8 @@ impl Op {
             Self::Concat(_) => "concat",
             Self::Softmax => "softmax",
             Self::GatherSum => "gather_sum",
+            Self::BranchLinear(_) => "branch_linear",
+            Self::Sigmoid => "sigmoid",
         }
     }
 

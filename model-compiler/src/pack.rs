@@ -12,9 +12,9 @@ use crate::qmodel::{
 use firmware::image::TensorRecord;
 use firmware::kernels::{k4n16, plan};
 use firmware::program::{
-    Add, Attention, AveragePool, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GatherSum, GlobalPool, KernelId,
-    LayerNorm, Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, Step, Term, TokenSource,
-    Tokens, WaypointDecoder,
+    Add, Attention, AveragePool, BranchLinear, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GatherSum,
+    GlobalPool, KernelId, LayerNorm, Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Sigmoid, Softmax,
+    Step, Term, TokenSource, Tokens, WaypointDecoder,
 };
 use firmware::tensor::TensorId;
 
@@ -306,6 +306,27 @@ impl Packer {
                     clamp: *clamp,
                 })
             }
+            QOp::BranchLinear { input, command, output, branches, weights, wide, rescale } => {
+                let outputs = narrow(u32::from(*branches) * u32::from(channels(output)), "outputs of all branches")?;
+                Step::BranchLinear(BranchLinear {
+                    input: tensor_id(*input)?,
+                    command: tensor_id(*command)?,
+                    output: tensor_id(*output)?,
+                    branches: *branches,
+                    kernel,
+                    weights: self.weights(kernel, *branches, outputs, weights)?,
+                    wide: *wide,
+                    rescale: self.rescale(rescale)?,
+                    scratch,
+                })
+            }
+            QOp::Sigmoid { input, output, input_zero_point, requant, tanh_table } => Step::Sigmoid(Sigmoid {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                input_zero_point: *input_zero_point,
+                requant: *requant,
+                tanh_table: self.constants.push(tanh_table)?,
+            }),
         })
     }
 

@@ -315,6 +315,25 @@ pub enum QOp {
         zero_point: i16,
         clamp: Clamp,
     },
+    BranchLinear {
+        input: QTensorId,
+        command: QTensorId,
+        output: QTensorId,
+        branches: u16,
+        /// `[B][O][I]`.
+        weights: Vec<i8>,
+        wide: bool,
+        /// Arrays are `[B][O]`; no second term.
+        rescale: QRescale,
+    },
+    Sigmoid {
+        input: QTensorId,
+        output: QTensorId,
+        input_zero_point: i16,
+        requant: Requant,
+        /// 513 entries.
+        tanh_table: Vec<i16>,
+    },
 }
 
 impl QModel {
@@ -344,18 +363,29 @@ impl QOp {
             Self::Concat { .. } => "concat",
             Self::Softmax { .. } => "softmax",
             Self::GatherSum { .. } => "gather_sum",
+            Self::BranchLinear { .. } => "branch_linear",
+            Self::Sigmoid { .. } => "sigmoid",
         }
     }
 
     /// Whether the operator bounds its output codes; the others copy codes or give fixed point.
     pub fn has_clamp(&self) -> bool {
-        !matches!(self, Self::MaxPool { .. } | Self::CopyBox { .. } | Self::Softmax { .. } | Self::WaypointDecoder(_))
+        !matches!(
+            self,
+            Self::MaxPool { .. }
+                | Self::CopyBox { .. }
+                | Self::Softmax { .. }
+                | Self::Sigmoid { .. }
+                | Self::WaypointDecoder(_)
+        )
     }
 
     /// Bounds of the output code.
     pub fn clamp_mut(&mut self) -> Option<&mut Clamp> {
         match self {
-            Self::Conv2d { rescale, .. } | Self::Linear { rescale, .. } => Some(&mut rescale.clamp),
+            Self::Conv2d { rescale, .. } | Self::Linear { rescale, .. } | Self::BranchLinear { rescale, .. } => {
+                Some(&mut rescale.clamp)
+            }
             Self::AveragePool { clamp, .. }
             | Self::GlobalPool { clamp, .. }
             | Self::Add { clamp, .. }
@@ -366,14 +396,20 @@ impl QOp {
             | Self::Attention { clamp, .. }
             | Self::Concat { clamp, .. }
             | Self::GatherSum { clamp, .. } => Some(clamp),
-            Self::MaxPool { .. } | Self::CopyBox { .. } | Self::Softmax { .. } | Self::WaypointDecoder(_) => None,
+            Self::MaxPool { .. }
+            | Self::CopyBox { .. }
+            | Self::Softmax { .. }
+            | Self::Sigmoid { .. }
+            | Self::WaypointDecoder(_) => None,
         }
     }
 
     /// Bytes of the weights (not bias, multipliers or tables).
     pub fn weight_bytes(&self) -> u64 {
         match self {
-            Self::Conv2d { weights, .. } | Self::Linear { weights, .. } => weights.len() as u64,
+            Self::Conv2d { weights, .. } | Self::Linear { weights, .. } | Self::BranchLinear { weights, .. } => {
+                weights.len() as u64
+            }
             Self::WaypointDecoder(d) => {
                 2 * (d.input_weights.len() + d.hidden_weights.len() + d.output_weights.len()) as u64
             }
@@ -398,7 +434,9 @@ impl QOp {
             | Self::Requantize { input, .. }
             | Self::LayerNorm { input, .. }
             | Self::CopyBox { input, .. }
-            | Self::Softmax { input, .. } => vec![*input],
+            | Self::Softmax { input, .. }
+            | Self::Sigmoid { input, .. } => vec![*input],
+            Self::BranchLinear { input, command, .. } => vec![*input, *command],
             Self::GlobalPool { first, second, .. } => {
                 std::iter::once(first.tensor).chain(second.map(|t| t.tensor)).collect()
             }
@@ -431,7 +469,9 @@ impl QOp {
             | Self::CopyBox { output, .. }
             | Self::Concat { output, .. }
             | Self::Softmax { output, .. }
-            | Self::GatherSum { output, .. } => *output,
+            | Self::GatherSum { output, .. }
+            | Self::BranchLinear { output, .. }
+            | Self::Sigmoid { output, .. } => *output,
             Self::WaypointDecoder(d) => d.output,
         }
     }

@@ -16,6 +16,7 @@ use std::collections::HashMap;
 use std::fmt;
 
 mod bounds;
+mod branches;
 mod copies;
 mod covariance;
 mod decoder;
@@ -24,6 +25,7 @@ mod gather_sum;
 mod moves;
 pub mod ranges;
 mod rounding;
+mod sigmoid;
 mod softmax;
 mod sums;
 pub mod tables;
@@ -186,7 +188,7 @@ pub fn quantize(
 struct Builder<'a> {
     graph: &'a Graph,
     statistics: &'a Statistics,
-    /// Mean per channel of each value as the layers read it.
+    /// Mean per channel (and branch, behind a command) of each value as the layers read it.
     quantized_means: Vec<Vec<f64>>,
     /// How what the layers read varies.
     covariances: Covariances,
@@ -237,6 +239,8 @@ impl Builder<'_> {
             Op::Clip(clip) => self.clip(node, *clip),
             Op::Softmax => self.softmax(node),
             Op::GatherSum => self.gather_sum(node),
+            Op::BranchLinear(layer) => self.branch_linear(node, layer),
+            Op::Sigmoid => self.sigmoid(node),
             Op::Normalize(_) | Op::BatchNorm(_) => Err(Error::new(
                 ErrorCode::Unsupported,
                 "",

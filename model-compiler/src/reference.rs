@@ -9,6 +9,7 @@ use crate::error::{Error, ErrorCode, Result};
 use crate::ir::{Graph, InputKind, Node, Op, Shape, ValueId};
 
 mod attention;
+mod branches;
 mod conv2d;
 mod elementwise;
 mod gather_sum;
@@ -23,6 +24,7 @@ mod tokens;
 mod waypoint_decoder;
 
 pub use attention::attention_weights;
+pub use branches::{Branches, run_branches};
 pub use rerun::{Change, rerun};
 
 #[cfg(test)]
@@ -47,7 +49,7 @@ impl Activations {
 /// Runs a graph and returns its outputs; a value is dropped after its last use.
 ///
 /// `inputs` are raw, in the order of [`Graph::inputs`]: image 0..=255 and BEV counts 0..=5, both
-/// `height × width × channels`; velocity `[m/s]`; goal `[right, forward-negative]` in m. `observe` sees every node with
+/// `height × width × channels`; velocity `[m/s]`; goal `[right, forward-negative]` in m; command `[1, 2, …]`. `observe` sees every node with
 /// its output, in order (for a BEV input that is counts / 5).
 ///
 /// # Errors
@@ -126,6 +128,8 @@ pub fn evaluate(op: &Op, input_shapes: &[Shape], inputs: &[&[f32]], output_shape
         Op::Concat(axis) => slice::concat(*axis, input_shapes, inputs),
         Op::Softmax => elementwise::softmax(inputs[0], usize::from(output_shape.channels)),
         Op::GatherSum => gather_sum::gather_sum(input_shapes[0], inputs, output_shape),
+        Op::BranchLinear(layer) => linear::branch_linear(layer, inputs),
+        Op::Sigmoid => elementwise::sigmoid(inputs[0]),
     }
 }
 

@@ -316,6 +316,10 @@ fn memory_changes() -> Vec<(Check, Change)> {
         (Check::ConstLength, Parts(|p| step!(p, at::LAYER_NORM, LayerNorm, |s| s.offsets.bytes -= 8))),
         (Check::ConstLength, Parts(|p| step!(p, at::ATTENTION, Attention, |s| s.exp_table.bytes -= 2))),
         (Check::ConstLength, Parts(|p| step!(p, at::SOFTMAX, Softmax, |s| s.exp_table.bytes -= 2))),
+        (Check::ConstLength, Parts(|p| step!(p, at::BRANCH_LINEAR, BranchLinear, |s| s.weights.bytes -= 1))),
+        (Check::ConstLength, Parts(|p| step!(p, at::BRANCH_LINEAR, BranchLinear, |s| s.rescale.bias.bytes = 12))),
+        (Check::ConstLength, Parts(|p| step!(p, at::BRANCH_LINEAR, BranchLinear, |s| s.branches = 3))),
+        (Check::ConstLength, Parts(|p| step!(p, at::SIGMOID, Sigmoid, |s| s.tanh_table.bytes -= 2))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.concat = true))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.tanh_table.bytes -= 2))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.biases.bytes -= 8))),
@@ -454,6 +458,25 @@ fn operator_changes() -> Vec<(Check, Change)> {
         (Check::StepClamp, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.clamp = Clamp { min: 1, max: 0 }))),
         (Check::StepMultiplier, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.requant.multiplier = 1 << 24))),
         (Check::StepShift, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.requant.shift = 0))),
+        (Check::StepBranches, Parts(|p| step!(p, at::BRANCH_LINEAR, BranchLinear, |s| s.branches = 0))),
+        (
+            Check::StepResidual,
+            Parts(|p| {
+                step!(p, at::BRANCH_LINEAR, BranchLinear, |s| {
+                    s.rescale.residual = Residual::Stream { tensor: s.output };
+                });
+            }),
+        ),
+        (
+            Check::StepElement,
+            Parts(|p| {
+                let command = record(p, ids::COMMAND);
+                (command.element, command.bytes) = (ElementType::I16, 2);
+            }),
+        ),
+        (Check::StepShift, Parts(|p| step!(p, at::SIGMOID, Sigmoid, |s| s.requant.shift = 0))),
+        (Check::StepMultiplier, Parts(|p| step!(p, at::SIGMOID, Sigmoid, |s| s.requant.multiplier = 1 << 24))),
+        (Check::StepZeroPoint, Parts(|p| step!(p, at::SIGMOID, Sigmoid, |s| s.input_zero_point = 1))),
         (Check::Work, Parts(|p| *p = endless_convolution())),
     ]
 }

@@ -178,12 +178,14 @@ pub fn inputs_file(frames: &[Frame]) -> Vec<u8> {
         let numbers = frames.iter().flat_map(|frame| &map(frame).as_ref().expect("lists of cells").data);
         Some((shape.to_vec(), numbers.flat_map(|&cell| i32::from(cell).to_le_bytes()).collect()))
     };
+    let commands = frames.iter().flat_map(|f| i32::from(f.command.expect("a command")).to_le_bytes()).collect();
     let (rgb, bev) = (maps(|f| &f.rgb), maps(|f| &f.bev));
     let mut tensors = vec![
         ("rgb", Dtype::U8, rgb.0, rgb.1),
         ("bev", Dtype::U8, bev.0, bev.1),
         ("velocity", Dtype::F32, vec![frames.len()], floats(|f| vec![f.velocity.expect("a speed")])),
         ("target", Dtype::F32, vec![frames.len(), 2], floats(|f| f.goal.expect("a goal").to_vec())),
+        ("command", Dtype::I32, vec![frames.len()], commands),
     ];
     let lists = [("bev_points", cells(|f| &f.bev_points)), ("cam_points", cells(|f| &f.camera_points))];
     tensors.extend(

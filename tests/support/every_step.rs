@@ -9,8 +9,8 @@ use firmware::tensor::Shape;
 use model_compiler::emit::{AlignedBytes, ImageParts, KnownAnswer};
 use model_compiler::frames::{ByteMap, Frame};
 use model_compiler::ir::{
-    Axis, Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Pad, Slice, Tokens, ValueId,
-    WaypointDecoder, Weights,
+    Axis, BranchLinear, Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Pad, Slice, Tokens,
+    ValueId, WaypointDecoder, Weights,
 };
 use model_compiler::pack::pack;
 use model_compiler::pipeline::{self, Compiled};
@@ -22,6 +22,8 @@ pub const SEED: u64 = 2026;
 
 /// Channels of both branches and of the transformer.
 const CHANNELS: usize = 4;
+/// Commands that select a branch.
+const BRANCHES: usize = 3;
 /// Height and width of both inputs.
 const SIZE: u16 = 16;
 
@@ -29,7 +31,7 @@ const SIZE: u16 = 16;
 const LISTS: Shape = Shape::map(2, 2, 6);
 
 /// Names of all operators, as [`firmware::program::Step::name`] gives them.
-pub const OPERATORS: [&str; 16] = [
+pub const OPERATORS: [&str; 18] = [
     "conv2d",
     "linear",
     "max_pool",
@@ -46,6 +48,8 @@ pub const OPERATORS: [&str; 16] = [
     "concat",
     "softmax",
     "gather_sum",
+    "branch_linear",
+    "sigmoid",
 ];
 
 /// The float network.
@@ -60,13 +64,14 @@ pub fn graph() -> Graph {
     let bev_points = b.graph.push_input("bev_points", InputKind::BevPoints, LISTS);
     let camera_points = b.graph.push_input("cam_points", InputKind::CameraPoints, LISTS);
     let goal = b.graph.push_input("goal", InputKind::Goal, Shape::vector(2));
+    let command = b.graph.push_input("command", InputKind::Command, Shape::vector(1));
     let image = b.image_branch(rgb);
     let stem = b.conv("lidar.stem", &[bev], Window::square(3, 2, 1), 1, None, Clip::RELU);
     let lidar = b.push("lidar.pool", Op::AveragePool(Window::square(2, 2, 0)), &[stem]);
-    let [image_tokens, lidar_tokens] = b.transformer(image, lidar, velocity);
+    let [image_tokens, lidar_normed] = b.transformer(image, lidar, velocity);
     let enlarged = Op::ResizeBilinear { factor: (2, 2) };
     let image = b.push("image.fused", enlarged.clone(), &[image_tokens, image]);
-    let lidar_tokens = b.push("lidar.enlarged", enlarged, &[lidar_tokens]);
+    let lidar_tokens = b.push("lidar.enlarged", enlarged, &[lidar_normed]);
     let lidar = b.push("lidar.fused", Op::Add { clip: Clip::RELU }, &[lidar, lidar_tokens]);
     let image_sums = b.push("image.gathered", Op::GatherSum, &[lidar, camera_points]);
     let lidar_sums = b.push("lidar.gathered", Op::GatherSum, &[image, bev_points]);
@@ -79,6 +84,8 @@ pub fn graph() -> Graph {
     let waypoints = b.push("waypoints", decoder, &[hidden, goal]);
     let probabilities = b.classifier(image, lidar, bev);
     b.graph.outputs.extend([waypoints, probabilities]);
+    let controls = b.controls(features, lidar_normed, bev, command);
+    b.graph.outputs.extend(controls);
     b.graph
 }
 
@@ -95,6 +102,7 @@ pub fn frames(seed: u64, count: usize) -> Vec<Frame> {
         bev: map(Shape::map(SIZE, SIZE, 2), 6),
         velocity: Some(1.5 * i as f64),
         goal: Some([2.0 - i as f64, -8.0 - 3.0 * i as f64]),
+        command: Some(1 + (i % BRANCHES) as u8),
         bev_points: map(LISTS, 4),
         camera_points: map(LISTS, 4),
         ..Frame::default()
@@ -202,6 +210,14 @@ impl Builder {
         self.push(name, Op::Linear(linear), inputs)
     }
 
+    fn branch_linear(&mut self, name: &str, input: ValueId, command: ValueId, outputs: usize, clip: Clip) -> ValueId {
+        let depth = self.channels(input);
+        let data = self.values(BRANCHES * outputs * depth, (3.0 / depth as f32).sqrt());
+        let weights = Arc::new(Weights { shape: vec![BRANCHES, outputs, depth], data });
+        let layer = BranchLinear { weights, bias: Some(self.bias(BRANCHES * outputs)), clip };
+        self.push(name, Op::BranchLinear(layer), &[input, command])
+    }
+
     fn layer_norm(&mut self, name: &str, input: ValueId, first_row: u16, grid: (u16, u16)) -> ValueId {
         let weight = Arc::new(self.values(CHANNELS, 0.3).into_iter().map(|v| 1.0 + v).collect());
         let norm = LayerNorm { weight, bias: self.bias(CHANNELS), epsilon: 1e-5, first_row, grid };
@@ -255,6 +271,17 @@ impl Builder {
         let counts = self.push("class.counts", Op::Pad(channels), &[counts]);
         let counts = self.push("class.likely", Op::Softmax, &[counts]);
         self.push("class.probabilities", Op::Concat(Axis::Width), &[probabilities, counts])
+    }
+
+    /// Branches on a vector and on a map, sigmoids of both and of a corner of an input.
+    fn controls(&mut self, vector: ValueId, map: ValueId, bev: ValueId, command: ValueId) -> [ValueId; 3] {
+        let hidden = self.branch_linear("branch.0", vector, command, 5, Clip::RELU);
+        let logits = self.branch_linear("branch.2", hidden, command, 3, Clip::NONE);
+        let controls = self.push("controls", Op::Sigmoid, &[logits]);
+        let gates = self.branch_linear("branch.map", map, command, 2, Clip::NONE);
+        let corner = Slice { begin: [7, 7, 0], end: [8, 8, 2], stride: [1; 3] };
+        let counts = self.push("branch.corner", Op::Slice(corner), &[bev]);
+        [controls, gates, self.push("branch.counts", Op::Sigmoid, &[counts])]
     }
 
     fn decoder(&mut self) -> Op {
@@ -313,6 +340,10 @@ mod tests {
         assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I8)));
         assert!(forms(&|s| matches!(s, Step::GatherSum(s) if element(s.input) == ElementType::I8)));
         assert!(forms(&|s| matches!(s, Step::GatherSum(s) if element(s.input) == ElementType::I16)));
+        assert!(forms(&|s| matches!(s, Step::BranchLinear(s) if element(s.input) == ElementType::I16)));
+        assert!(forms(&|s| matches!(s, Step::BranchLinear(s) if element(s.input) == ElementType::I8)));
+        assert!(forms(&|s| matches!(s, Step::Sigmoid(s) if element(s.input) == ElementType::I16)));
+        assert!(forms(&|s| matches!(s, Step::Sigmoid(s) if element(s.input) == ElementType::I8)));
         let in_place = parts.tensors.iter().filter(|tensor| tensor.in_place_of.is_some()).count();
         assert!(in_place >= 3, "{in_place} tensors in place");
     }

@@ -211,8 +211,9 @@ fn channels_last(maps: &[u8], i: usize, channels: usize) -> Vec<f32> {
 /// What the original network gave for the stored frames.
 #[derive(Clone, Debug)]
 pub struct Expected {
-    /// Per frame: waypoints `[right, forward-negative]`, m.
-    pub waypoints: Vec<[[f32; 2]; 4]>,
+    /// Result to its values per frame: `waypoints` are `[right, forward-negative]`, m; of CILRS `steer`, `throttle`,
+    /// `brake` and `velocity`.
+    pub results: BTreeMap<String, Vec<Vec<f32>>>,
     /// Module name to spatial mean per frame and channel (of a transformer: of its image tokens' part).
     pub taps: BTreeMap<String, Vec<Vec<f32>>>,
 }
@@ -220,12 +221,10 @@ pub struct Expected {
 /// The stored results of a system.
 pub fn expected(system: System) -> Expected {
     let file = Stored::read(&format!("{}.safetensors", system.name()));
-    let waypoints = file.float("expect.waypoints");
-    let waypoints = waypoints.chunks_exact(8).map(|w| std::array::from_fn(|t| [w[2 * t], w[2 * t + 1]])).collect();
     let frames =
         |values: &[f32], count: usize| values.chunks_exact(values.len() / count).map(<[f32]>::to_vec).collect();
-    let taps = file.floats("tap.").into_iter().map(|(name, v)| (name, frames(&v, 4))).collect();
-    Expected { waypoints, taps }
+    let named = |prefix: &str| file.floats(prefix).into_iter().map(|(name, v)| (name, frames(&v, 4))).collect();
+    Expected { results: named("expect."), taps: named("tap.") }
 }
 
 /// The value of an imported graph (before or after the passes) that a tap of this module is the mean of: a container's
@@ -313,6 +312,7 @@ mod tests {
             (System::LateFusion, 0xcd82_6882),
             (System::TransFuser, 0x9953_4b15),
             (System::GeometricFusion, 0xd579_3ed8),
+            (System::Cilrs, 0xfdc5_b069),
         ] {
             assert_eq!(crc(&checkpoint(system)), expected, "{}", system.name());
         }
@@ -366,11 +366,17 @@ mod tests {
 
     #[test]
     fn stored_results_are_complete() {
-        for (system, taps) in
-            [(System::Aim, 5), (System::LateFusion, 9), (System::TransFuser, 13), (System::GeometricFusion, 9)]
-        {
+        for (system, taps, values) in [
+            (System::Aim, 5, 8),
+            (System::LateFusion, 9, 8),
+            (System::TransFuser, 13, 8),
+            (System::GeometricFusion, 9, 8),
+            (System::Cilrs, 4, 4),
+        ] {
             let expected = expected(system);
-            assert_eq!((expected.waypoints.len(), expected.taps.len()), (4, taps));
+            assert!(expected.results.values().all(|frames| frames.len() == 4));
+            let of_first: usize = expected.results.values().map(|frames| frames[0].len()).sum();
+            assert_eq!((of_first, expected.taps.len()), (values, taps));
             assert!(expected.taps.values().all(|t| t.len() == 4 && t[0].len() >= 64));
         }
     }

@@ -1,7 +1,7 @@
 //! Support for the integration tests.
 
-pub mod boards;
 pub mod agent;
+pub mod boards;
 pub mod build;
 pub mod bundle;
 pub mod commands;

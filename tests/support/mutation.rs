@@ -33,8 +33,10 @@ const NUMBERS: [i64; 17] = [
 ];
 
 /// Fields of steps that name a tensor.
-const TENSOR_FIELDS: [&str; 12] =
-    ["input", "indices", "output", "tensor", "map", "velocity", "query", "key", "value", "hidden", "goal", "scratch"];
+const TENSOR_FIELDS: [&str; 13] = [
+    "input", "indices", "output", "tensor", "map", "velocity", "query", "key", "value", "hidden", "goal", "command",
+    "scratch",
+];
 
 /// Visits every mutation of an image.
 ///

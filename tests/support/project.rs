@@ -91,6 +91,7 @@ fn write_inputs(frames: &[Frame], path: &Path) {
     let floats = |values: fn(&Frame) -> Vec<f64>| -> Vec<u8> {
         frames.iter().flat_map(values).flat_map(|v| (v as f32).to_le_bytes()).collect()
     };
+    let commands = frames.iter().flat_map(|f| i32::from(f.command.unwrap_or(0)).to_le_bytes()).collect();
     let shape = frames[0].rgb.as_ref().unwrap().shape;
     let (count, height, width) = (frames.len(), usize::from(shape.height), usize::from(shape.width));
     let tensors = [
@@ -98,6 +99,7 @@ fn write_inputs(frames: &[Frame], path: &Path) {
         ("bev", Dtype::U8, vec![count, 2, height, width], bytes(|f| &f.bev)),
         ("velocity", Dtype::F32, vec![count], floats(|f| f.velocity.into_iter().collect())),
         ("target", Dtype::F32, vec![count, 2], floats(|f| f.goal.into_iter().flatten().collect())),
+        ("command", Dtype::I32, vec![count], commands),
     ];
     let views = tensors.iter().map(|(name, element, shape, data)| {
         (*name, TensorView::new(*element, shape.clone(), data).expect("shape and data agree"))

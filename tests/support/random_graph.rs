@@ -306,7 +306,8 @@ impl Drawing {
             }
         }
         if self.flag() {
-            vector = self.push(Op::Softmax, &[vector]);
+            let op = if self.random.below(3) == 0 { Op::Sigmoid } else { Op::Softmax };
+            vector = self.push(op, &[vector]);
         }
         self.graph.outputs.push(vector);
         if self.random.below(3) == 0 {

@@ -3,8 +3,8 @@
 use firmware::image::layout::{header, region, tensor};
 use firmware::image::{Check, SectionKind, TensorRecord, layout};
 use firmware::program::{
-    Add, Attention, AveragePool, Clamp, ConstRange, Conv2d, CopyBox, KernelId, LayerNorm, Linear, MaxPool, Requant,
-    Requantize, Rescale, Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, Window,
+    Add, Attention, AveragePool, BranchLinear, Clamp, ConstRange, Conv2d, CopyBox, KernelId, LayerNorm, Linear,
+    MaxPool, Requant, Requantize, Rescale, Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, Window,
 };
 use firmware::tensor::{ElementType, Shape, TensorId};
 use model_compiler::emit::{ImageParts, ImagePort, assemble, reseal};
@@ -465,6 +465,8 @@ fn of_operators() -> Vec<(Check, Vec<u8>)> {
         (Check::StepElement, words_as_codes()),
         (Check::StepBox, boxed([2, 1, 1], 0)),
         (Check::StepBorder, boxed([1, 1, 1], 200)),
+        (Check::StepBranches, branched(0, false)),
+        (Check::StepResidual, branched(2, true)),
         (Check::Work, sealed(&work.finish(sums))),
     ]
 }
@@ -571,6 +573,29 @@ fn boxed(begin: [u16; 3], border: i16) -> Vec<u8> {
     let output = sketch.tensor(ElementType::I8, Shape::map(2, 2, 2));
     let (stride, size, before) = ([1; 3], [1; 3], [1; 3]);
     sketch.steps.push(Step::CopyBox(CopyBox { input, output, begin, stride, size, before, border }));
+    sealed(&sketch.finish(output))
+}
+
+/// A linear layer of so many branches, with or without a second term.
+fn branched(branches: u16, residual: bool) -> Vec<u8> {
+    let mut sketch = Sketch::default();
+    let (input, command) = (sketch.input(Shape::vector(4)), sketch.input(Shape::vector(1)));
+    let output = sketch.tensor(ElementType::I8, Shape::vector(4));
+    let weights = sketch.constant(16 * u32::from(branches));
+    let residual = if residual { Residual::Stream { tensor: input } } else { Residual::None };
+    let rescale = Rescale { residual, ..sketch.rescale(4 * branches) };
+    let (kernel, scratch) = (KernelId::Direct, sketch.scratch(32));
+    sketch.steps.push(Step::BranchLinear(BranchLinear {
+        input,
+        command,
+        output,
+        branches,
+        kernel,
+        weights,
+        wide: false,
+        rescale,
+        scratch,
+    }));
     sealed(&sketch.finish(output))
 }
 

@@ -5,8 +5,8 @@ use super::draw::Draw;
 use super::{Case, Difference, Outcome, first_difference};
 use crate::fixed_point::{EXP_TABLE_LEN, TANH_TABLE_LEN};
 use crate::kernels::{
-    AttentionArgs, Kernels, LayerNormArgs, Portable, SoftmaxArgs, TokenSourceArgs, TokensArgs, WaypointDecoderArgs,
-    plan,
+    AttentionArgs, Kernels, LayerNormArgs, Portable, SigmoidArgs, SoftmaxArgs, TokenSourceArgs, TokensArgs,
+    WaypointDecoderArgs, plan,
 };
 use crate::program::Requant;
 use crate::tensor::{Codes, CodesMut, ElementType, Shape, index};
@@ -125,16 +125,41 @@ pub(super) fn softmax(case: &mut Case<'_>, number: u32) -> Outcome {
     })
 }
 
+/// Codes apart and in place.
+pub(super) fn sigmoid(case: &mut Case<'_>, number: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let (elements, element) = (index(number % 130 + 1), draw.element());
+    let args = SigmoidArgs {
+        input_zero_point: draw.zero_point(element),
+        requant: Requant { multiplier: draw.multiplier(), shift: draw.byte(8, 30) },
+        tanh_table: tanh_table(draw)?,
+    };
+    let codes = if draw.flag() { Some(draw.codes(element, elements)?.codes()?) } else { None };
+    let stored = draw.codes(ElementType::I16, elements)?;
+    case.describe(format_args!("{elements} elements, {element:?}, in place: {}", codes.is_none()));
+    case.compare(stored, elements, |kernels, output| {
+        if let CodesMut::I16(output) = output {
+            kernels.sigmoid(&args, codes, output);
+        }
+    })
+}
+
+/// A line from 0 that ends at one, Q15.
+fn tanh_table<'m>(draw: &mut Draw<'m>) -> Option<&'m [i16]> {
+    let table = draw.take::<i16>(TANH_TABLE_LEN)?;
+    for (entry, k) in table.iter_mut().zip(0_i16..) {
+        *entry = k.saturating_mul(256);
+    }
+    Some(table)
+}
+
 /// Both forms of the goal.
 pub(super) fn waypoint_decoder(case: &mut Case<'_>, number: u32) -> Outcome {
     let draw = &mut case.draw;
     let hidden_size = u16::try_from(number % 70 + 1).ok()?;
     let (size, concat) = (usize::from(hidden_size), draw.flag());
     let inputs = if concat { 4 } else { 2 };
-    let tanh_table = draw.take::<i16>(TANH_TABLE_LEN)?;
-    for (entry, k) in tanh_table.iter_mut().zip(0_i16..) {
-        *entry = k.saturating_mul(256);
-    }
+    let tanh_table = tanh_table(draw)?;
     let args = WaypointDecoderArgs {
         hidden_size,
         steps: 4,

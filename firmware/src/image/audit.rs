@@ -9,7 +9,7 @@
 
 use super::{Image, TensorRecord};
 use crate::kernels::k4n16::{COMPENSATION_FACTOR, Packed};
-use crate::program::{ConstRange, Conv2d, KernelId, Linear, Rescale, Residual, Step};
+use crate::program::{ConstRange, Conv2d, KernelId, Rescale, Residual, Step};
 use crate::tensor::{ElementType, TensorId, index};
 use core::fmt;
 use core::ops::RangeInclusive;
@@ -157,7 +157,14 @@ impl<'a> Auditor<'_, 'a> {
     fn step(&self, step: &Step, result: &mut Audit) -> Result<(), AuditError> {
         match step {
             Step::Conv2d(step) => self.weighted(&self.conv2d(step)?, &step.rescale, result),
-            Step::Linear(step) => self.weighted(&self.linear(step)?, &step.rescale, result),
+            Step::Linear(step) => {
+                let weights = self.linear(step.kernel, step.weights, [step.input, step.output], step.wide)?;
+                self.weighted(&weights, &step.rescale, result)
+            }
+            Step::BranchLinear(step) => {
+                let weights = self.linear(step.kernel, step.weights, [step.input, step.output], step.wide)?;
+                self.weighted(&weights, &step.rescale, result)
+            }
             Step::ResizeBilinear(step) => {
                 let input = self.record(step.input.tensor)?.shape;
                 let weight = 1_u16.checked_shl(step.weight_bits.into()).unwrap_or_default();
@@ -170,6 +177,7 @@ impl<'a> Auditor<'_, 'a> {
             }
             Step::Attention(step) => self.within::<i16>(Array::ExpTable, step.exp_table, 0..=i16::MAX.into()),
             Step::Softmax(step) => self.within::<i16>(Array::ExpTable, step.exp_table, 0..=i16::MAX.into()),
+            Step::Sigmoid(step) => self.within::<i16>(Array::TanhTable, step.tanh_table, 0..=i16::MAX.into()),
             Step::WaypointDecoder(step) => {
                 self.within::<u8>(Array::Shifts, step.shifts, 0..=30)?;
                 self.within::<i16>(Array::TanhTable, step.tanh_table, 0..=i16::MAX.into())
@@ -192,15 +200,22 @@ impl<'a> Auditor<'_, 'a> {
         })
     }
 
-    fn linear(&self, step: &Linear) -> Result<Weights<'a>, AuditError> {
-        let input = self.record(step.input)?;
+    /// One block of weights, or several that follow each other like groups.
+    fn linear(
+        &self,
+        kernel: KernelId,
+        weights: ConstRange,
+        [input, output]: [TensorId; 2],
+        wide: bool,
+    ) -> Result<Weights<'a>, AuditError> {
+        let input = self.record(input)?;
         Ok(Weights {
-            kernel: step.kernel,
-            codes: self.read(step.weights)?,
-            outputs: self.record(step.output)?.shape.channels,
+            kernel,
+            codes: self.read(weights)?,
+            outputs: self.record(output)?.shape.channels,
             depth: input.shape.channels.into(),
             largest_code: if input.element == ElementType::I16 { 32768 } else { 383 },
-            wide: step.wide,
+            wide,
         })
     }
 

@@ -119,6 +119,8 @@ checks! {
     StepFraction: "the fraction bits of the hidden state are out of range",
     StepBox: "the box leaves the input or the output",
     StepBorder: "the code of the border is outside the element type",
+    StepBranches: "the number of branches is out of range",
+    StepResidual: "the operator has no second term",
     Work: "the program would run too long",
 }
 

@@ -18,6 +18,7 @@ pub(super) mod oracle;
 pub mod pool;
 mod product;
 pub mod resize_bilinear;
+pub mod sigmoid;
 pub mod softmax;
 pub mod tokens;
 pub mod waypoint_decoder;

@@ -19,7 +19,7 @@ pub(super) fn validate(step: &Conv2d, context: &StepContext<'_, '_>) -> Result<u
     let weights = plan::weight_bytes(step.kernel, step.groups, output.channels, depth);
     context.constants::<i8>(step.weights, weights)?;
     context.constants::<i8>(step.padding_codes, input.channels.into())?;
-    rescale::validate(&step.rescale, step.output, context)?;
+    rescale::validate(&step.rescale, step.output, 1, context)?;
     let scratch = plan::conv2d_scratch_bytes(step.kernel, input, output, step.window, step.groups);
     context.scratch(step.scratch, scratch)?;
     Ok(output.elements().saturating_mul(depth))

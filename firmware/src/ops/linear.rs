@@ -12,7 +12,7 @@ pub(super) fn validate(step: &Linear, context: &StepContext<'_, '_>) -> Result<u
     context.ensure_equal(Check::StepShape, output.positions(), input.positions())?;
     let weights = plan::weight_bytes(step.kernel, 1, output.channels, input.channels.into());
     context.constants::<i8>(step.weights, weights)?;
-    rescale::validate(&step.rescale, step.output, context)?;
+    rescale::validate(&step.rescale, step.output, 1, context)?;
     let scratch = plan::linear_scratch_bytes(step.kernel, input.positions(), input.channels, record.element);
     context.scratch(step.scratch, scratch)?;
     Ok(output.elements().saturating_mul(input.channels.into()))

@@ -7,10 +7,16 @@ use crate::kernels::{RescaleArgs, ResidualArgs};
 use crate::program::{Rescale, Residual};
 use crate::tensor::TensorId;
 
-/// Arrays of the output's channel count; a residual of the output's shape, and of its type where it is a stream.
-pub(super) fn validate(rescale: &Rescale, output: TensorId, context: &StepContext<'_, '_>) -> Result<(), ParseError> {
+/// Arrays of the output's channel count, times the number of blocks; a residual of the output's shape, and of its type
+/// where it is a stream.
+pub(super) fn validate(
+    rescale: &Rescale,
+    output: TensorId,
+    blocks: u16,
+    context: &StepContext<'_, '_>,
+) -> Result<(), ParseError> {
     let record = context.activation(output)?;
-    let channels = u64::from(record.shape.channels);
+    let channels = u64::from(record.shape.channels).saturating_mul(blocks.into());
     context.ensure_within(Check::StepPreShift, rescale.pre_shift, 0..=36)?;
     context.constants::<i32>(rescale.bias, channels)?;
     context.constants::<i32>(rescale.multipliers, channels)?;

@@ -40,8 +40,9 @@ impl<'a> Tabulation<'a> {
 
     /// Multiply-accumulates of a step; `None` where its work is of another kind.
     fn step_macs(&self, position: usize) -> Option<u64> {
-        use Step::{Attention, Conv2d, Linear, WaypointDecoder};
-        let multiplies = matches!(self.program[position], Conv2d(_) | Linear(_) | Attention(_) | WaypointDecoder(_));
+        use Step::{Attention, BranchLinear, Conv2d, Linear, WaypointDecoder};
+        let step = &self.program[position];
+        let multiplies = matches!(step, Conv2d(_) | Linear(_) | BranchLinear(_) | Attention(_) | WaypointDecoder(_));
         multiplies.then(|| self.image.step_work(position as u16)).flatten()
     }
 

@@ -14,6 +14,7 @@ mod attention;
 mod changes;
 mod channels;
 mod classes;
+mod controls;
 mod frames;
 mod gates;
 mod graph;
@@ -44,6 +45,7 @@ pub fn page(report: &VerifyReport, frames: &[Frame]) -> String {
         (channels::section(&report.steps))
         (memory::section(&report.memory, &report.summary))
         (waypoints::section(&report.frames, frames))
+        (controls::section(&report.frames))
         (classes::section(report.summary.accuracy.as_ref(), &report.frames))
         (frames::section(&report.frames))
         (steps::section(&report.steps))

@@ -1,7 +1,7 @@
 //! The forms for people: tables with a line per frame or step, and a short summary.
 
 use super::figures::{figure, signed};
-use super::{FrameReport, StepReport, VerifyReport, classes};
+use super::{FrameReport, StepReport, VerifyReport, classes, controls};
 use crate::ablation::Row;
 use crate::diff::{Diff, FigureChange, MENTIONED_DB, StepChange};
 use crate::gates::GateOutcome;
@@ -20,13 +20,21 @@ pub use score::score;
 /// Changed steps that a terminal shows.
 const MAX_CHANGES: usize = 20;
 
-/// Waypoints or classes of every frame.
+/// Waypoints, controls or classes of every frame.
 pub fn run(report: &RunReport) -> String {
     let head = format!("{} (sha256 {}…)", report.model.name, &report.model.sha256[..16]);
     let waypoints = |frame: &FrameResult| match &frame.output {
         Output::Waypoints { waypoints } => Some((frame.name.clone(), waypoints.clone())),
-        Output::Class(_) => None,
+        Output::Controls(_) | Output::Class(_) => None,
     };
+    let given = report.frames.iter().filter_map(|frame| match &frame.output {
+        Output::Controls(prediction) => Some((frame.name.as_str(), prediction)),
+        Output::Waypoints { .. } | Output::Class(_) => None,
+    });
+    let given: Vec<_> = given.collect();
+    if !given.is_empty() {
+        return format!("{head}, controls as the network gives them\n\n{}", controls::run(&given));
+    }
     let driven: Vec<(String, Waypoints)> = report.frames.iter().filter_map(waypoints).collect();
     if driven.is_empty() {
         return format!("{head}\n\n{}", classes::run(report));
@@ -81,6 +89,9 @@ pub fn ablation(rows: &[Row]) -> String {
     if rows.iter().any(|row| row.fidelity.classes.is_some()) {
         return classes::ablation(rows);
     }
+    if rows.iter().any(|row| !row.fidelity.controls.is_empty()) {
+        return controls::ablation(rows);
+    }
     let waypoints = rows.first().map_or(0, |row| row.fidelity.mean_mm.len());
     let numbered = |what: &str| (1..=waypoints).map(|k| format!("{what} mm {k}")).collect::<Vec<_>>();
     let header = [vec!["variant".to_owned(), "vector dB".to_owned()], numbered("mean"), numbered("worst")].concat();
@@ -132,6 +143,7 @@ pub fn summary(report: &VerifyReport) -> String {
             error.max
         );
     }
+    text += &controls::verify(&s.control_error);
     text += &s.accuracy.as_ref().map(classes::verify).unwrap_or_default();
     let _ = writeln!(
         text,
@@ -152,7 +164,11 @@ pub fn diff(diff: &Diff) -> String {
         text += "the two reports are about different frames\n";
     }
     let header = ["figure", "before", "after", "change", ""].map(str::to_owned).to_vec();
-    let digits = |unit: &str| if unit == "B" { 0 } else { 1 };
+    let digits = |unit: &str| match unit {
+        "B" => 0,
+        "" => controls::DIGITS,
+        _ => 1,
+    };
     let row = |change: &FigureChange| {
         let digits = digits(&change.unit);
         let difference = change.before.zip(change.after).map(|(before, after)| after - before);

@@ -60,7 +60,7 @@ fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
         bev,
         velocity: format.velocity.then(|| description.number("speed")).transpose()?,
         goal: format.goal.then(|| description.goal()).transpose()?,
-        command: description.command()?,
+        command: description.command(format.command)?,
         bev_points,
         camera_points,
         dropped_points,
@@ -133,9 +133,9 @@ impl Description {
         }
     }
 
-    fn command(&self) -> Result<Option<u8>> {
+    fn command(&self, needed: bool) -> Result<Option<u8>> {
         match &self.json["command"] {
-            Value::Null => Ok(None),
+            Value::Null if !needed => Ok(None),
             value => match value.as_u64() {
                 Some(command @ 1..=6) => Ok(Some(command as u8)),
                 _ => Err(self.bad("command", "1..6")),
@@ -296,7 +296,9 @@ mod tests {
         let aim =
             FrameFormat::new("aim", [(InputKind::Image, Shape::map(4, 4, 3)), (InputKind::Goal, Shape::vector(2))]);
         let frame = load(root.path(), &aim).unwrap().remove(0);
-        assert!(frame.bev.is_none() && frame.velocity.is_none());
+        assert!(frame.bev.is_none() && frame.velocity.is_none() && frame.command.is_none());
+        let message = load(root.path(), &FrameFormat { command: true, ..aim }).unwrap_err().to_string();
+        assert!(message.contains("frame.json: `command`: missing, expected 1..6"), "{message}");
     }
 
     /// Another axis convention and sensor height, the same scene: the golden histogram was made from this very sweep.

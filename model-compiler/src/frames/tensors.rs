@@ -1,6 +1,6 @@
 //! Ready network inputs in a `.safetensors` file: `rgb` u8 `[N,3,H,W]`, `bev` u8 `[N,2,H,W]` (counts 0..=5), `velocity`
-//! f32 `[N]`, `target` f32 `[N,2]` (network frame), `bev_points` and `cam_points` i32 `[N,H,W,K,2]` (cells that see the
-//! same points), and optionally `command` i32 `[N]`.
+//! f32 `[N]`, `target` f32 `[N,2]` (network frame), `command` i32 `[N]` (1..=6), `bev_points` and `cam_points` i32
+//! `[N,H,W,K,2]` (cells that see the same points).
 //!
 //! Of a classifier: the image by the network's own name for it, or as `rgb`, `[N,C,H,W]`, and optionally `label` i64
 //! `[N]`. Images may be f32 as well; they are raw, so every value is a whole number 0..=255.
@@ -34,8 +34,8 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
     let goal = format.goal.then(|| batch.floats("target", &[2])).transpose()?;
     let points = |batch: &mut Batch<'_>, name| format.points.map(|shape| batch.cells(name, shape)).transpose();
     let (bev_points, camera_points) = (points(&mut batch, "bev_points")?, points(&mut batch, "cam_points")?);
+    let command = batch.commands(format.command)?;
     let count = batch.frames.unwrap_or(0);
-    let command = batch.commands(count)?;
     let labels = format.classes.map(|classes| batch.labels(classes)).transpose()?.flatten();
     if count == 0 {
         return Err(Error::new(ErrorCode::Frames, "", "holds no frame that this network could read"));
@@ -163,14 +163,25 @@ impl<'a> Batch<'a> {
         }
     }
 
-    /// Commands are no input of these networks: used where they fit, ignored where not.
-    fn commands(&mut self, frames: usize) -> Result<Option<Vec<u8>>> {
-        let Ok(view) = self.file.tensor("command") else { return Ok(None) };
-        if view.dtype() != Dtype::I32 || view.shape() != [frames] {
-            return Ok(None);
+    /// Commands of a network that reads them; of others used where they fit, ignored where not.
+    fn commands(&mut self, needed: bool) -> Result<Option<Vec<u8>>> {
+        let found = match needed {
+            true => Some(self.tensor("command", Dtype::I32, &[])?),
+            false => {
+                let fits = |v: &TensorView<'_>| v.dtype() == Dtype::I32 && v.shape() == [self.frames.unwrap_or(0)];
+                self.file.tensor("command").ok().filter(fits)
+            }
+        };
+        let Some(view) = found else { return Ok(None) };
+        let command = |bytes: &[u8; 4]| {
+            let value = i32::from_le_bytes(*bytes);
+            u8::try_from(value).ok().filter(|c| (1..=6).contains(c)).ok_or(value)
+        };
+        match view.data().as_chunks::<4>().0.iter().map(command).collect::<std::result::Result<_, _>>() {
+            Ok(commands) => Ok(Some(commands)),
+            Err(_) if !needed => Ok(None),
+            Err(value) => Err(tensor_error("command", format!("holds {value}, expected 1..=6"))),
         }
-        let values = view.data().chunks_exact(4).map(|b| i32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-        Ok(values.map(|v| u8::try_from(v).ok().filter(|c| (1..=6).contains(c))).collect())
     }
 }
 
@@ -238,6 +249,22 @@ mod tests {
         assert_eq!(frames[1].rgb.as_ref().unwrap().data, [6, 8, 10, 7, 9, 11]);
         assert_eq!(frames[0].bev.as_ref().unwrap().data, [0, 2, 1, 3]);
         assert_eq!((frames[1].velocity, frames[1].goal, frames[1].command), (Some(2.5), Some([3.0, -4.0]), Some(4)));
+    }
+
+    #[test]
+    fn a_network_that_reads_commands_needs_them() {
+        let format = FrameFormat::new("cilrs", [(InputKind::Command, Shape::vector(1))]);
+        let commands = |dtype, values: &[i32]| {
+            let bytes = values.iter().flat_map(|v| v.to_le_bytes()).collect();
+            [Tensor("command", dtype, vec![values.len()], bytes)]
+        };
+        let frames = load_as(&format, &commands(Dtype::I32, &[6, 1])).unwrap();
+        assert_eq!(frames.iter().map(|frame| frame.command).collect::<Vec<_>>(), [Some(6), Some(1)]);
+        let message = |tensors: &[Tensor]| load_as(&format, tensors).unwrap_err().to_string();
+        assert!(message(&commands(Dtype::I32, &[1, 7])).contains("tensor `command`: holds 7, expected 1..=6"));
+        assert!(message(&commands(Dtype::F32, &[1])).contains("tensor `command`: F32 [1], expected I32 [N]"));
+        assert!(message(&good()[..1]).contains("tensor `command`: missing; this network needs it"));
+        assert_eq!(load_tensors(&good()[..4]).unwrap()[0].command, None, "others do not");
     }
 
     #[test]

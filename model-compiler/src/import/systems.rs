@@ -10,6 +10,7 @@ use builder::Builder;
 
 mod aim;
 mod builder;
+mod cilrs;
 mod detect;
 mod geometric_fusion;
 mod head;
@@ -33,7 +34,7 @@ fn has(tensors: &NamedTensors, prefix: &str) -> bool {
 pub(super) fn detect(tensors: &NamedTensors) -> Option<System> {
     let recognized: [(System, bool); 6] = [
         (System::Lbc, has(tensors, "net.network.backbone.")),
-        (System::Cilrs, has(tensors, "encoder.features.") && has(tensors, "controller.")),
+        (System::Cilrs, cilrs::recognize(tensors)),
         (System::GeometricFusion, geometric_fusion::recognize(tensors)),
         (System::TransFuser, transfuser::recognize(tensors)),
         (System::LateFusion, late_fusion::recognize(tensors)),
@@ -49,10 +50,11 @@ pub(super) fn build(system: System, name: &str, tensors: NamedTensors, options: 
         System::LateFusion => late_fusion::build,
         System::TransFuser => transfuser::build,
         System::GeometricFusion => geometric_fusion::build,
-        System::Cilrs | System::Lbc => {
+        System::Cilrs => cilrs::build,
+        System::Lbc => {
             let message = format!("this is a checkpoint of {}, which is not supported", system.name());
             return Err(Error::new(ErrorCode::Unsupported, "", message)
-                .with_help("supported are aim, late_fusion, transfuser and geometric_fusion"));
+                .with_help("supported are aim, late_fusion, transfuser, geometric_fusion and cilrs"));
         }
     };
     if options.fusion_scales.is_some() && system != System::GeometricFusion {

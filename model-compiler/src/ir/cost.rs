@@ -52,6 +52,11 @@ impl Op {
                 all.extend(linear.bias.iter().map(|b| vector("bias", b)));
                 all
             }
+            Self::BranchLinear(layer) => {
+                let mut all = vec![matrix("weights", &layer.weights)];
+                all.extend(layer.bias.iter().map(|b| vector("bias", b)));
+                all
+            }
             Self::Tokens(tokens) => {
                 let mut all = vec![
                     vector("velocity weights", &tokens.velocity_weights),
@@ -81,7 +86,8 @@ impl Op {
             | Self::Pad(_)
             | Self::Concat(_)
             | Self::Softmax
-            | Self::GatherSum => Vec::new(),
+            | Self::GatherSum
+            | Self::Sigmoid => Vec::new(),
         }
     }
 }
@@ -110,6 +116,8 @@ impl Graph {
         match &node.op {
             Op::Conv2d(conv) => output.elements() * per_channel(&conv.weights),
             Op::Linear(linear) => output.elements() * per_channel(&linear.weights),
+            // One branch alone is computed.
+            Op::BranchLinear(layer) => output.elements() * layer.weights.shape[2] as u64,
             Op::Tokens(_) => u64::from(output.channels),
             Op::Attention { .. } => 2 * output.elements() * u64::from(output.positions()),
             Op::WaypointDecoder(d) => {

@@ -1,6 +1,6 @@
 //! Shape rules and the checklist of graph invariants.
 
-use super::{Clip, Conv2d, Graph, Linear, Node, Op, Shape, ValueId};
+use super::{BranchLinear, Clip, Conv2d, Graph, Linear, Node, Op, Shape, ValueId};
 use std::collections::HashSet;
 
 /// Checks every invariant of the [module page](super) and of the names, and collects all violations.
@@ -93,9 +93,11 @@ impl Checklist<'_> {
             }
         }
         let clip = match &node.op {
-            Op::Conv2d(Conv2d { clip, .. }) | Op::Linear(Linear { clip, .. }) | Op::Clip(clip) | Op::Add { clip } => {
-                *clip
-            }
+            Op::Conv2d(Conv2d { clip, .. })
+            | Op::Linear(Linear { clip, .. })
+            | Op::BranchLinear(BranchLinear { clip, .. })
+            | Op::Clip(clip)
+            | Op::Add { clip } => *clip,
             _ => Clip::NONE,
         };
         if clip.min > clip.max || clip.min.is_nan() || clip.max.is_nan() {
@@ -206,7 +208,7 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
             }
             Ok(inputs[0])
         }
-        Op::Clip(_) | Op::Softmax => {
+        Op::Clip(_) | Op::Softmax | Op::Sigmoid => {
             arity(op, inputs, 1..=1)?;
             Ok(inputs[0])
         }
@@ -252,6 +254,20 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
                 same_shape("residual", residual, out)?;
             }
             Ok(out)
+        }
+        Op::BranchLinear(layer) => {
+            arity(op, inputs, 2..=2)?;
+            let w = &layer.weights.shape;
+            expect("rank of branch weights", w.len(), 3)?;
+            if w[0] == 0 {
+                return Err("branches: found 0, expected at least 1".into());
+            }
+            expect("input channels", w[2], channels(inputs[0]))?;
+            if let Some(bias) = &layer.bias {
+                expect("bias length", bias.len(), w[0] * w[1])?;
+            }
+            expect("command values", inputs[1].elements() as usize, 1)?;
+            Ok(Shape { channels: narrow("output channels", w[1])?, ..inputs[0] })
         }
         Op::Tokens(tokens) => {
             arity(op, inputs, 3..=3)?;

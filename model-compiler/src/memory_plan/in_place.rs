@@ -25,7 +25,7 @@ pub(super) fn overwritable(model: &QModel, op: &QOp, pooling: bool, sums: bool) 
         QOp::Add { first, second, .. } if sums => vec![first.tensor, second.tensor],
         QOp::ResizeBilinear { residual: Some(residual), .. } if sums => vec![residual.tensor],
         QOp::Attention { query, .. } if sums => vec![*query],
-        QOp::Softmax { input, .. } if sums => vec![*input],
+        QOp::Softmax { input, .. } | QOp::Sigmoid { input, .. } if sums => vec![*input],
         _ => vec![],
     };
     let reads = op.reads();

@@ -126,7 +126,9 @@ pub(super) fn scratch_room(bytes: u64, alignment: u64) -> u64 {
 fn kernel(model: &QModel, target: &Target, op: &QOp) -> Option<KernelId> {
     match op {
         QOp::Conv2d { output, groups, .. } => target.kernel_for(*groups, model.tensor(*output).shape.channels),
-        QOp::Linear { output, .. } => target.kernel_for(1, model.tensor(*output).shape.channels),
+        QOp::Linear { output, .. } | QOp::BranchLinear { output, .. } => {
+            target.kernel_for(1, model.tensor(*output).shape.channels)
+        }
         _ => None,
     }
 }
@@ -139,7 +141,7 @@ pub(super) fn scratch_bytes(model: &QModel, op: &QOp, kernel: Option<KernelId>) 
         QOp::Conv2d { input, output, window, groups, .. } => {
             plan::conv2d_scratch_bytes(kernel, shape(input), shape(output), *window, *groups)
         }
-        QOp::Linear { input, .. } => {
+        QOp::Linear { input, .. } | QOp::BranchLinear { input, .. } => {
             let element = model.tensor(*input).element;
             plan::linear_scratch_bytes(kernel, shape(input).positions(), shape(input).channels, element)
         }

@@ -1,16 +1,18 @@
 //! The clip (ReLU) after a convolution, linear layer or addition into that operator.
 
 use super::rewrite::merge_into_reader;
-use crate::ir::{Conv2d, Graph, Linear, Op};
+use crate::ir::{BranchLinear, Conv2d, Graph, Linear, Op};
 
 pub(super) fn run(graph: &mut Graph) {
     merge_into_reader(graph, |producer, reader, _| {
         let Op::Clip(next) = reader.op else { return None };
         let mut op = producer.op.clone();
         match &mut op {
-            Op::Conv2d(Conv2d { clip, .. }) | Op::Linear(Linear { clip, .. }) | Op::Add { clip } | Op::Clip(clip) => {
-                *clip = clip.then(next);
-            }
+            Op::Conv2d(Conv2d { clip, .. })
+            | Op::Linear(Linear { clip, .. })
+            | Op::BranchLinear(BranchLinear { clip, .. })
+            | Op::Add { clip }
+            | Op::Clip(clip) => *clip = clip.then(next),
             _ => return None,
         }
         Some((op, producer.inputs.clone()))

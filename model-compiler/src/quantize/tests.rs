@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::calibrate::calibrate;
-use crate::ir::{Axis, Clip, InputKind, Linear, Pad, Slice, Weights};
+use crate::ir::{Axis, BranchLinear, Clip, InputKind, Linear, Pad, Slice, Weights};
 use firmware::program::Requant;
 use std::sync::Arc;
 
@@ -142,6 +142,62 @@ fn logits_are_kept_in_16_bits_up_to_the_largest_softmax() {
     let error = wide((1 << 15) + 1).unwrap_err();
     assert_eq!((error.code, error.location.as_str()), (ErrorCode::Numeric, "node softmax"));
     assert!(error.to_string().contains("softmax over 32769 channels, expected at most 32768"), "{error}");
+}
+
+/// Three branches of very different ranges, then a second layer of branches, then sigmoids of small values.
+fn branches() -> (Graph, [ValueId; 2]) {
+    let (mut graph, x) = image(Shape::vector(3));
+    let command = graph.push_input("command", InputKind::Command, Shape::vector(1));
+    let layer = |inputs: usize, amplitudes: [f32; 3]| {
+        let data = amplitudes.iter().flat_map(|a| (0..4 * inputs).map(move |i| a * ((i * 7 % 11) as f32 - 4.0)));
+        let weights = Weights { shape: vec![3, 4, inputs], data: data.collect() };
+        let bias = amplitudes.iter().flat_map(|a| (0..4).map(move |i| a * 20.0 * i as f32)).collect();
+        Op::BranchLinear(BranchLinear { weights: Arc::new(weights), bias: Some(Arc::new(bias)), clip: Clip::RELU })
+    };
+    let pooled = graph.push("pooled", Op::GlobalPool, &[x]).unwrap();
+    let first = graph.push("first", layer(3, [0.01, 0.1, 1.0]), &[pooled, command]).unwrap();
+    let second = graph.push("second", layer(4, [1e-3, 1e-4, 1e-5]), &[first, command]).unwrap();
+    let sigmoid = graph.push("sigmoid", Op::Sigmoid, &[second]).unwrap();
+    graph.outputs = vec![sigmoid];
+    (graph, [first, sigmoid])
+}
+
+#[test]
+fn a_branch_that_no_frame_selects_is_calibrated_like_any_other() {
+    let (graph, [first, sigmoid]) = branches();
+    let frames: Vec<_> = (0..40).map(|i| vec![vec![(i * 37 % 256) as f32, 9.0, 200.0], vec![1.0]]).collect();
+    let statistics = calibrate(&graph, &frames, |_, _| ()).unwrap();
+    let means = &statistics.of(first).channel_mean;
+    assert_eq!(means.len(), 12, "four channels of three branches");
+    assert!((means[9] / means[1] - 100.0).abs() < 0.1, "{means:?}");
+    for bias_correction in [false, true] {
+        let options = QuantizeOptions { bias_correction, ..Default::default() };
+        let model = quantize(&graph, &frames, &statistics, &options, |_, _| ()).unwrap();
+        let stored = |value: ValueId| model.tensors.iter().find(|t| t.value == graph.value(value).name).unwrap();
+        assert_eq!((stored(first).element, stored(sigmoid).scale), (ElementType::I16, f64::exp2(-15.0)));
+        for command in [1.0, 2.0, 3.0] {
+            let raw = [vec![77.0, 9.0, 200.0], vec![command]];
+            let expected = crate::reference::run(&graph, &raw, |_, _| ()).unwrap();
+            let raw = raw.iter().map(|input| input.iter().map(|&x| f64::from(x)).collect::<Vec<_>>());
+            let kinds = model.inputs.iter().filter_map(|port| port.kind);
+            let codes: Vec<_> =
+                kinds.zip(raw).map(|(kind, raw)| crate::integer_reference::encode_input(kind, &raw)).collect();
+            let found = crate::integer_reference::run(&model, &codes, |_, _, _| ()).unwrap();
+            for (found, expected) in found[0].iter().zip(&expected[0]) {
+                let error = (found / 32768.0 - f64::from(*expected)).abs();
+                assert!(error < 0.01, "command {command}: {found} for {expected}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_plain_layer_behind_branches_is_corrected_by_the_mean_of_all() {
+    let means = [1.0, 2.0, 5.0, 10.0];
+    assert_eq!(calibrate::branch_means(&means, 2, Some(1)), [5.0, 10.0]);
+    assert_eq!(calibrate::branch_means(&means, 2, Some(7)), [5.0, 10.0], "the last serves further commands");
+    assert_eq!(calibrate::branch_means(&means, 2, None), [3.0, 6.0]);
+    assert_eq!(calibrate::branch_means(&means, 4, Some(3)), means);
 }
 
 #[test]

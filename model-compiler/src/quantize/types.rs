@@ -7,10 +7,10 @@
 //! | queries, keys, values | i8 symmetric |
 //! | residual stream of a transformer | i16, one scale for all its taps |
 //! | skip values of the ResNets | i8 affine, or i16 per stage |
-//! | global pools and the vectors behind them, logits of a softmax | i16 |
-//! | probabilities | i16, scale 2^-15 |
+//! | global pools and the vectors behind them, vectors behind the velocity, what a softmax or sigmoid reads | i16 |
+//! | probabilities, results of a sigmoid | i16, scale 2^-15 |
 //! | GRU start state | i16, a power of two |
-//! | velocity, goal, waypoints | fixed point |
+//! | velocity, goal, command, waypoints | fixed point |
 //!
 //! Pools, slices and pads copy codes, so what they give is stored like what they read (`copies`).
 
@@ -106,12 +106,12 @@ pub(super) enum Role {
     Stream(usize),
     /// A value that skips over a residual block.
     Skip,
-    /// A pooled vector or a vector behind it.
+    /// A pooled vector or a vector behind it, or behind the velocity.
     Vector,
     /// Start state of the decoder.
     Hidden,
     Waypoints,
-    /// Results of a softmax.
+    /// Results of a softmax or sigmoid.
     Probabilities,
 }
 
@@ -133,6 +133,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
             Role::Input(InputKind::Image) => Stored::fixed(ElementType::I8, 1.0, -128),
             Role::Input(InputKind::Bev) => Stored::fixed(ElementType::I8, 0.2, 0),
             Role::Input(InputKind::BevPoints | InputKind::CameraPoints) => Stored::fixed(ElementType::I8, 1.0, 0),
+            Role::Input(InputKind::Command) => Stored::fixed(ElementType::I8, 1.0, 0),
             Role::Input(InputKind::Velocity) => Stored::fixed(ElementType::I16, f64::exp2(-8.0), 0),
             Role::Input(InputKind::Goal) | Role::Waypoints => Stored::fixed(ElementType::I32, f64::exp2(-16.0), 0),
             Role::Narrow => narrow(),
@@ -180,9 +181,10 @@ fn roles(graph: &Graph) -> Vec<Role> {
             }
             Op::Linear(_) => match (of(0), of(1)) {
                 (_, Some(stream @ Role::Stream(_))) => stream,
-                (Some(Role::Vector), _) => Role::Vector,
+                (Some(Role::Vector | Role::Input(InputKind::Velocity)), _) => Role::Vector,
                 _ => Role::Narrow,
             },
+            Op::BranchLinear(_) if of(0) == Some(Role::Vector) => Role::Vector,
             Op::Add { .. } => match (of(0), of(1)) {
                 (Some(stream @ Role::Stream(_)), _) | (_, Some(stream @ Role::Stream(_))) => stream,
                 (Some(Role::Vector), _) | (_, Some(Role::Vector)) => Role::Vector,
@@ -195,7 +197,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
             Op::AveragePool(_) if graph.value(node.output).shape.positions() == 1 => Role::Vector,
             Op::Concat(_) if (0..node.inputs.len()).any(wide) => Role::Vector,
             Op::Slice(_) | Op::Pad(_) | Op::Clip(_) if of(0) == Some(Role::Vector) => Role::Vector,
-            Op::Softmax => Role::Probabilities,
+            Op::Softmax | Op::Sigmoid => Role::Probabilities,
             Op::WaypointDecoder(_) => Role::Waypoints,
             _ => Role::Narrow,
         };
@@ -208,8 +210,8 @@ fn roles(graph: &Graph) -> Vec<Role> {
                 (Op::Attention { .. }, Role::Narrow) => *role = Role::Symmetric,
                 (Op::WaypointDecoder(_), _) => *role = Role::Hidden,
                 (Op::Attention { .. }, _) => {}
-                (Op::Softmax, Role::Narrow | Role::Skip) => *role = Role::Vector,
-                (Op::Softmax, _) => {}
+                (Op::Softmax | Op::Sigmoid, Role::Narrow | Role::Skip) => *role = Role::Vector,
+                (Op::Softmax | Op::Sigmoid, _) => {}
                 (_, Role::Narrow) => *role = Role::Skip,
                 _ => {}
             }
@@ -229,7 +231,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
 fn promoted(node: &Node) -> Vec<ValueId> {
     match &node.op {
         Op::Attention { .. } => node.inputs.clone(),
-        Op::WaypointDecoder(_) | Op::Softmax => vec![node.inputs[0]],
+        Op::WaypointDecoder(_) | Op::Softmax | Op::Sigmoid => vec![node.inputs[0]],
         Op::Conv2d(_) | Op::ResizeBilinear { .. } => node.inputs.iter().skip(1).copied().collect(),
         Op::MaxPool(_) => vec![node.inputs[0], node.output],
         _ => Vec::new(),

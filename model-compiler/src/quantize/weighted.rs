@@ -3,8 +3,9 @@
 use super::factors::{self, Factor, bits, round};
 use super::rounding::Rounding;
 use super::{Builder, bounds_of};
+use crate::calibrate;
 use crate::error::{Error, ErrorCode, Result};
-use crate::ir::{Clip, Conv2d, Linear, Node, Normalization, Weights};
+use crate::ir::{Clip, Conv2d, Linear, Node, Normalization, ValueId, Weights};
 use crate::qmodel::{Bounds, QOp, QRescale, QResidual, QTensorId};
 use firmware::tensor::ElementType;
 use std::sync::Arc;
@@ -14,14 +15,17 @@ const REQUANT_ACCUMULATOR_BITS: u32 = 28;
 const TERM_ACCUMULATOR_BITS: u32 = 31;
 
 /// The weights of one layer as the quantizer sees them: `outputs` rows of `taps × inputs`.
-struct Layer<'a> {
-    weights: &'a [f32],
-    bias: Option<&'a [f32]>,
-    outputs: usize,
-    inputs: usize,
-    groups: usize,
-    normalization: Option<&'a Normalization>,
-    clip: Clip,
+pub(super) struct Layer<'a> {
+    pub weights: &'a [f32],
+    pub bias: Option<&'a [f32]>,
+    /// Of all branches.
+    pub outputs: usize,
+    pub inputs: usize,
+    pub groups: usize,
+    /// Blocks of outputs of which a command selects one; 1 where there is nothing to select.
+    pub branches: usize,
+    pub normalization: Option<&'a Normalization>,
+    pub clip: Clip,
 }
 
 impl Layer<'_> {
@@ -62,10 +66,12 @@ impl Builder<'_> {
             outputs: conv.weights.shape[0],
             inputs: conv.weights.shape[3],
             groups: usize::from(conv.groups),
+            branches: 1,
             normalization: conv.normalization.as_deref(),
             clip: conv.clip,
         };
-        let (weights, rescale, bounds, _) = self.weighted(node, &layer, input)?;
+        let residual = node.inputs.get(1).copied();
+        let (weights, rescale, bounds, _) = self.weighted(node, &layer, input, residual)?;
         let output = self.tensor(node.output);
         let padding_codes = match &conv.normalization {
             Some(n) => n.mean.iter().map(|&mean| (round(f64::from(mean)) - 128.0).clamp(-128.0, 127.0) as i8).collect(),
@@ -84,23 +90,27 @@ impl Builder<'_> {
             outputs: linear.weights.shape[0],
             inputs: linear.weights.shape[1],
             groups: 1,
+            branches: 1,
             normalization: None,
             clip: linear.clip,
         };
-        let (weights, rescale, bounds, wide) = self.weighted(node, &layer, input)?;
+        let residual = node.inputs.get(1).copied();
+        let (weights, rescale, bounds, wide) = self.weighted(node, &layer, input, residual)?;
         let output = self.tensor(node.output);
         self.step(node, QOp::Linear { input, output, weights, wide, rescale }, bounds);
         Ok(())
     }
 
-    fn weighted(
+    /// Weights, epilogue and bounds of a layer, and whether its accumulators need 64 bits.
+    pub(super) fn weighted(
         &mut self,
         node: &Node,
         layer: &Layer<'_>,
         input: QTensorId,
+        residual: Option<ValueId>,
     ) -> Result<(Vec<i8>, QRescale, Bounds, bool)> {
         let output = self.tensor(node.output);
-        let residual = node.inputs.get(1).map(|&value| self.tensor(value));
+        let residual = residual.map(|value| self.tensor(value));
         let integer = self.integer_layer(node, layer, input, output)?;
         let (rescale, mut bounds) = self.rescale(layer, &integer, input, output, residual)?;
         let half = f64::exp2(f64::from(rescale.pre_shift)) / 2.0;
@@ -133,8 +143,13 @@ impl Builder<'_> {
         let zero_point = f64::from(self.zero_point(input));
         let magnitude = self.magnitude(input);
         let raw_magnitude = if self.model.tensor(input).element == ElementType::I8 { 383.0 } else { 32768.0 };
-        let means = &self.statistics.of(source).channel_mean;
-        let quantized_means = &self.quantized_means[source.0 as usize];
+        let channels = layer.inputs * layer.groups;
+        let of_branches = |means: &[f64]| -> Vec<Vec<f64>> {
+            let branch = |branch| calibrate::branch_means(means, channels, (layer.branches > 1).then_some(branch));
+            (0..layer.branches).map(branch).collect()
+        };
+        let means = of_branches(&self.statistics.of(source).channel_mean);
+        let quantized_means = of_branches(&self.quantized_means[source.0 as usize]);
         let roundings: Vec<Rounding> = match self.covariances.of(node.output) {
             Some(covariances) => covariances.iter().map(Rounding::by).collect(),
             None => vec![Rounding::nearest(); layer.groups],
@@ -154,12 +169,13 @@ impl Builder<'_> {
                 .max(bias.abs() / (input_scale * f64::exp2(27.0)))
                 .max(f64::exp2(-26.0) * output_scale / input_scale);
             let codes = roundings[o / (layer.outputs / layer.groups)].round(&row, scale);
+            let branch = o / (layer.outputs / layer.branches);
             let mean_of = |k: usize| layer.normalization.map_or(0.0, |n| f64::from(n.mean[layer.channel(o, k)]));
             if self.options.bias_correction {
                 // What the layer gives on average with quantized weights and inputs, less what it should give.
                 let mean_error = |(k, (q, w)): (usize, (&f64, &f64))| {
                     let (channel, center) = (layer.channel(o, k), mean_of(k));
-                    q * scale * (quantized_means[channel] - center) - w * (means[channel] - center)
+                    q * scale * (quantized_means[branch][channel] - center) - w * (means[branch][channel] - center)
                 };
                 bias -= codes.iter().zip(&row).enumerate().map(mean_error).sum::<f64>();
             }

@@ -71,6 +71,11 @@ pub(super) fn softmax(x: &[f32], channels: usize) -> Vec<f32> {
     out
 }
 
+/// `1 / (1 + exp(−x))`; f64 inside.
+pub(super) fn sigmoid(x: &[f32]) -> Vec<f32> {
+    x.iter().map(|&x| (1.0 / (1.0 + (-f64::from(x)).exp())) as f32).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -108,6 +113,13 @@ mod tests {
     fn softmax_sums_to_one_and_keeps_ratios() {
         let out = softmax(&[0.0, f32::ln(3.0), 1000.0, 1000.0], 2);
         let expected = [0.25, 0.75, 0.5, 0.5];
+        assert!(out.iter().zip(expected).all(|(o, e)| (o - e).abs() < 1e-6), "{out:?}");
+    }
+
+    #[test]
+    fn sigmoid_has_its_known_values() {
+        let out = sigmoid(&[0.0, f32::ln(3.0), -f32::ln(3.0), 1000.0, -1000.0]);
+        let expected = [0.5, 0.75, 0.25, 1.0, 0.0];
         assert!(out.iter().zip(expected).all(|(o, e)| (o - e).abs() < 1e-6), "{out:?}");
     }
 

@@ -42,8 +42,11 @@ pub mod ids {
     pub const PROBABILITIES: u16 = 25;
     pub const CELLS: u16 = 26;
     pub const GATHERED: u16 = 27;
+    pub const COMMAND: u16 = 26;
+    pub const BRANCH: u16 = 27;
+    pub const CONTROLS: u16 = 28;
     /// First scratch record.
-    pub const SCRATCH: u16 = 28;
+    pub const SCRATCH: u16 = 31;
 }
 
 /// Positions of the sample's steps.
@@ -69,9 +72,11 @@ pub mod at {
     pub const CONCAT: usize = 20;
     pub const SOFTMAX: usize = 21;
     pub const GATHER_SUM: usize = 22;
+    pub const BRANCH_LINEAR: usize = 22;
+    pub const SIGMOID: usize = 23;
 }
 
-pub const STEPS: usize = 23;
+pub const STEPS: usize = 25;
 
 /// Deterministic constants.
 struct Numbers {
@@ -159,6 +164,12 @@ pub fn parts() -> ImageParts {
             port("waypoints", ids::WAYPOINTS),
             port("probabilities", ids::PROBABILITIES),
             port("gathered", ids::GATHERED),
+            port("command", ids::COMMAND),
+        ],
+        outputs: vec![
+            port("waypoints", ids::WAYPOINTS),
+            port("probabilities", ids::PROBABILITIES),
+            port("controls", ids::CONTROLS),
         ],
         arena_bytes,
         arena_alignment: 16,
@@ -199,6 +210,9 @@ fn shapes() -> Vec<(Shape, ElementType)> {
         (Shape::map(7, 4, 8), I16),
         (Shape::map(2, 3, 6), I8),
         (Shape::map(2, 3, 8), I16),
+        (Shape::vector(1), I8),
+        (Shape::vector(3), I16),
+        (Shape::vector(3), I16),
     ]
 }
 
@@ -268,6 +282,8 @@ fn steps(n: &mut Numbers) -> Vec<Step> {
         concat(),
         softmax(n),
         gather_sum(),
+        branch_linear(n),
+        sigmoid(n),
     ]
 }
 
@@ -377,9 +393,11 @@ fn resize(n: &mut Numbers) -> Step {
     })
 }
 
+fn tanh_table() -> Vec<i16> {
+    (0..513).map(|k| ((f64::from(k) / 64.0).tanh() * 32768.0).round().min(32767.0) as i16).collect()
+}
+
 fn decoder(n: &mut Numbers) -> Step {
-    let table: Vec<i16> =
-        (0..513).map(|k| ((f64::from(k) / 64.0).tanh() * 32768.0).round().min(32767.0) as i16).collect();
     Step::WaypointDecoder(WaypointDecoder {
         hidden: TensorId(ids::HIDDEN),
         goal: TensorId(ids::GOAL),
@@ -398,7 +416,7 @@ fn decoder(n: &mut Numbers) -> Step {
         output_bias: n.push(2, -1000, 1000, |v| v),
         output_pre_shift: 0,
         output_requant: [requant(); 2],
-        tanh_table: n.builder.push(&table).expect("fits"),
+        tanh_table: n.builder.push(&tanh_table()).expect("fits"),
         scratch: None,
     })
 }
@@ -436,6 +454,30 @@ fn gather_sum() -> Step {
     })
 }
 
+fn branch_linear(n: &mut Numbers) -> Step {
+    Step::BranchLinear(BranchLinear {
+        input: TensorId(ids::VECTOR),
+        command: TensorId(ids::COMMAND),
+        output: TensorId(ids::BRANCH),
+        branches: 4,
+        kernel: KernelId::Direct,
+        weights: n.weights(4 * 3 * 8),
+        wide: false,
+        rescale: n.rescale(4 * 3, I16, Residual::None),
+        scratch: None,
+    })
+}
+
+fn sigmoid(n: &mut Numbers) -> Step {
+    Step::Sigmoid(Sigmoid {
+        input: TensorId(ids::BRANCH),
+        output: TensorId(ids::CONTROLS),
+        input_zero_point: 0,
+        requant: requant(),
+        tanh_table: n.builder.push(&tanh_table()).expect("fits"),
+    })
+}
+
 /// Pairs of output and overwritten operand.
 fn in_place(shapes: &[(Shape, ElementType)]) -> Vec<(u16, u16)> {
     let mut pairs = vec![
@@ -445,6 +487,7 @@ fn in_place(shapes: &[(Shape, ElementType)]) -> Vec<(u16, u16)> {
         (ids::SUM, ids::LIDAR_NARROW),
         (ids::BLOCK, ids::FUSED),
         (ids::PROBABILITIES, ids::JOINED),
+        (ids::CONTROLS, ids::BRANCH),
     ];
     let [input, output] = [ids::STEM, ids::POOLED].map(|id| shapes[usize::from(id)].0);
     if plan::max_pool_in_place(input, output, Window::square(2, 2, 0)) {
@@ -515,6 +558,10 @@ fn scratch_bytes(step: &Step, records: &[TensorRecord]) -> u32 {
             let input = record(s.input);
             plan::linear_scratch_bytes(s.kernel, input.shape.positions(), input.shape.channels, input.element)
         }
+        Step::BranchLinear(s) => {
+            let input = record(s.input);
+            plan::linear_scratch_bytes(s.kernel, input.shape.positions(), input.shape.channels, input.element)
+        }
         Step::Attention(s) => {
             let shape = record(s.output).shape;
             plan::attention_scratch_bytes(shape.positions(), shape.channels, s.heads).max(16)
@@ -528,6 +575,7 @@ fn set_scratch(step: &mut Step, id: TensorId) {
     match step {
         Step::Conv2d(s) => s.scratch = Some(id),
         Step::Linear(s) => s.scratch = Some(id),
+        Step::BranchLinear(s) => s.scratch = Some(id),
         Step::Attention(s) => s.scratch = Some(id),
         Step::WaypointDecoder(s) => s.scratch = Some(id),
         _ => unreachable!("no scratch"),

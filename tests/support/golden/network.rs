@@ -6,7 +6,7 @@ use model_compiler::import::{NamedTensor, NamedTensors, System, TensorData};
 /// Sizes of a network; the published ones, small ones for fast tests, or an ablation of either.
 #[derive(Clone, Debug)]
 pub struct Network {
-    /// Which of the four waypoint systems.
+    /// Which of the published systems.
     pub system: System,
     /// Channels of stem and first stage.
     pub stem: usize,
@@ -32,6 +32,10 @@ pub struct Network {
     pub join: Vec<usize>,
     /// Input width of the GRU: 2 (added) or 4 (concatenated).
     pub gru_inputs: usize,
+    /// Of CILRS: hidden size of its heads.
+    pub hidden: usize,
+    /// Of CILRS: branches, one per command.
+    pub branches: usize,
 }
 
 impl Network {
@@ -41,7 +45,7 @@ impl Network {
             system,
             stem: 64,
             widths: [64, 128, 256, 512],
-            image_blocks: [3, 4, 6, 3],
+            image_blocks: if system == System::Cilrs { [2; 4] } else { [3, 4, 6, 3] },
             lidar_blocks: [2; 4],
             layers: 8,
             grid: (8, 8),
@@ -51,6 +55,8 @@ impl Network {
             projection: vec![512; 3],
             join: vec![256, 128, 64],
             gru_inputs: if matches!(system, System::TransFuser | System::GeometricFusion) { 2 } else { 4 },
+            hidden: 256,
+            branches: 6,
         }
     }
 
@@ -66,6 +72,7 @@ impl Network {
             embedding: 20,
             projection: vec![24, 12, 28],
             join: vec![24, 16],
+            hidden: 16,
             ..Self::published(system)
         }
     }
@@ -78,6 +85,11 @@ impl Network {
     /// Names and shapes of the checkpoint.
     pub fn shapes(&self) -> Vec<(String, Vec<usize>)> {
         let mut list = List(Vec::new());
+        if self.system == System::Cilrs {
+            self.resnet(&mut list, "encoder.features", 3, &self.image_blocks);
+            self.controller(&mut list);
+            return list.0;
+        }
         let root = match self.system {
             System::TransFuser | System::GeometricFusion => "encoder.",
             _ => "",
@@ -181,6 +193,18 @@ impl Network {
         pointwise(list, format!("encoder.{side}_deconv{scale}"), c, input);
     }
 
+    fn controller(&self, list: &mut List) {
+        list.linear("controller.vel_in.0", self.hidden, 1);
+        list.linear("controller.vel_in.2", self.widths[3], self.hidden);
+        let mut head = |module: &str, outputs: usize| {
+            list.linear(&format!("{module}.0"), self.hidden, self.widths[3]);
+            list.linear(&format!("{module}.2"), self.hidden, self.hidden);
+            list.linear(&format!("{module}.4"), outputs, self.hidden);
+        };
+        head("controller.vel_out", 1);
+        (0..self.branches).for_each(|branch| head(&format!("controller.branches.{branch}"), 3));
+    }
+
     fn head(&self, list: &mut List) {
         let mut input = self.widths[3];
         for (layer, &width) in self.join.iter().enumerate() {
@@ -241,7 +265,7 @@ mod tests {
 
     #[test]
     fn published_networks_have_the_published_names_and_shapes() {
-        for system in [System::Aim, System::LateFusion, System::TransFuser, System::GeometricFusion] {
+        for system in [System::Aim, System::LateFusion, System::TransFuser, System::GeometricFusion, System::Cilrs] {
             let mut shapes = Network::published(system).shapes();
             shapes.sort();
             assert_eq!(shapes, golden::shapes(system), "{}", system.name());

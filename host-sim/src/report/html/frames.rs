@@ -2,6 +2,7 @@
 
 use super::table;
 use crate::report::FrameReport;
+use crate::report::controls::DIGITS;
 use crate::report::figures::figure;
 use maud::{Markup, html};
 
@@ -15,7 +16,9 @@ pub(super) fn section(frames: &[FrameReport]) -> Markup {
     let mut sorted: Vec<&FrameReport> = frames.iter().collect();
     sorted.sort_by(|a, b| b.badness().total_cmp(&a.badness()));
     let row = |frame: &&FrameReport| {
-        let errors: Vec<String> = frame.waypoint_error_mm.iter().map(|&mm| figure(Some(mm), 0)).collect();
+        let distances = frame.waypoint_error_mm.iter().map(|&mm| figure(Some(mm), 0));
+        let controls = frame.control_errors().into_iter().map(|(_, error)| figure(Some(error), DIGITS));
+        let errors: Vec<String> = distances.chain(controls).collect();
         vec![
             frame.name.clone(),
             if frame.calibration { "yes" } else { "no" }.to_owned(),
@@ -27,8 +30,9 @@ pub(super) fn section(frames: &[FrameReport]) -> Markup {
         ]
     };
     let rows: Vec<_> = sorted.iter().take(SHOWN).map(row).collect();
-    let header =
-        ["frame", "calibration", "worst step", "its dB", "pooled vector, dB", "first output, dB", "waypoint error, mm"];
+    let gives_controls = frames.iter().any(|frame| frame.control.is_some());
+    let error = if gives_controls { "error of steer, throttle, brake, speed" } else { "waypoint error, mm" };
+    let header = ["frame", "calibration", "worst step", "its dB", "pooled vector, dB", "first output, dB", error];
     let about = html! {
         "Figures of every frame by itself, the worst first."
         @if sorted.len() > SHOWN { " Shown are " (SHOWN) " of " (sorted.len()) " frames." }

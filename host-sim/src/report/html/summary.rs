@@ -1,6 +1,7 @@
 //! What ran, whether it passed, and the figures to remember.
 
 use crate::report::VerifyReport;
+use crate::report::controls::{DIGITS, titled};
 use crate::report::figures::{bytes, decibels, figure};
 use maud::{Markup, html};
 
@@ -96,6 +97,11 @@ fn figures(report: &VerifyReport) -> Vec<(&'static str, String, String)> {
         let means: Vec<String> = summary.waypoint_error_mm.iter().map(|e| figure(Some(e.mean), 0)).collect();
         let note = format!("mean of waypoints 1 to {}; the last is {:.0} mm off at most", means.len(), last.max);
         figures.push(("Waypoint error", format!("{} mm", means.join(", ")), note));
+    }
+    if !summary.control_error.is_empty() {
+        let means: Vec<String> = summary.control_error.iter().map(|e| figure(Some(e.mean), DIGITS)).collect();
+        let names: Vec<String> = summary.control_error.iter().map(|e| titled(&e.name)).collect();
+        figures.push(("Control error", means.join(", "), format!("mean of {}", names.join("; "))));
     }
     let arena = format!("bound {}: {}", bytes(summary.arena_bound_bytes), summary.arena_status.words());
     figures.push(("Arena", bytes(summary.arena_bytes), arena));
