@@ -42,9 +42,9 @@ pub mod ids {
     pub const PROBABILITIES: u16 = 25;
     pub const CELLS: u16 = 26;
     pub const GATHERED: u16 = 27;
-    pub const COMMAND: u16 = 26;
-    pub const BRANCH: u16 = 27;
-    pub const CONTROLS: u16 = 28;
+    pub const COMMAND: u16 = 28;
+    pub const BRANCH: u16 = 29;
+    pub const CONTROLS: u16 = 30;
     /// First scratch record.
     pub const SCRATCH: u16 = 31;
 }
@@ -72,8 +72,8 @@ pub mod at {
     pub const CONCAT: usize = 20;
     pub const SOFTMAX: usize = 21;
     pub const GATHER_SUM: usize = 22;
-    pub const BRANCH_LINEAR: usize = 22;
-    pub const SIGMOID: usize = 23;
+    pub const BRANCH_LINEAR: usize = 23;
+    pub const SIGMOID: usize = 24;
 }
 
 pub const STEPS: usize = 25;
@@ -159,16 +159,12 @@ pub fn parts() -> ImageParts {
             port("velocity", ids::VELOCITY),
             port("goal", ids::GOAL),
             port("cells", ids::CELLS),
-        ],
-        outputs: vec![
-            port("waypoints", ids::WAYPOINTS),
-            port("probabilities", ids::PROBABILITIES),
-            port("gathered", ids::GATHERED),
             port("command", ids::COMMAND),
         ],
         outputs: vec![
             port("waypoints", ids::WAYPOINTS),
             port("probabilities", ids::PROBABILITIES),
+            port("gathered", ids::GATHERED),
             port("controls", ids::CONTROLS),
         ],
         arena_bytes,
