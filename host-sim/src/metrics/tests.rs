@@ -168,7 +168,8 @@ fn means_are_plain_averages() {
 fn bad_logs_are_refused_with_the_field() {
     let good = drive(20);
     assert_eq!(good.check(), Ok(()));
-    let cases: [(&str, fn(&mut RouteLog)); 9] = [
+    type Damage = fn(&mut RouteLog);
+    let cases: [(&str, Damage); 9] = [
         ("schema: found version 2, expected 1", |log| log.schema = 2),
         ("waypoints: the route has no length: it has 0", |log| log.waypoints.clear()),
         ("waypoints: the route has no length: it has 3", |log| log.waypoints = vec![[1.0, 2.0]; 3]),
@@ -217,4 +218,21 @@ fn logs_come_from_files_and_errors_name_them() {
         let error = super::score(&[path(name)]).unwrap_err().to_string();
         assert!(error.contains(name) && error.contains(expected), "{error}");
     }
+    // The same on the command line.
+    let command = |arguments: &[&str]| {
+        let arguments = ["host-sim", "score"].into_iter().chain(arguments.iter().copied());
+        let arguments = arguments.map(|word| if word.contains(".json") { path(word).into() } else { word.into() });
+        let (mut out, mut err) = (Vec::new(), Vec::new());
+        let status = crate::cli::main(arguments, crate::cli::Console { out: &mut out, err: &mut err });
+        (status, String::from_utf8(out).unwrap(), String::from_utf8(err).unwrap())
+    };
+    let (status, table, _) = command(&["a.json", "b.json"]);
+    assert!(status == 0 && table.contains("straight") && table.contains("mean of 2"), "{table}");
+    let (status, document, _) = command(&["a.json", "b.json", "--json"]);
+    let document: serde_json::Value = serde_json::from_str(&document).unwrap();
+    assert_eq!((status, &document["mean"]["driving_score"]), (0, &score.mean.driving_score.into()));
+    assert_eq!((&document["schema"], &document["routes"][0]["ending"]), (&1.into(), &"log_ends".into()));
+    let (status, _, error) = command(&["a.json", "early.json"]);
+    assert!(status == 2 && error.contains("early.json: events[0]"), "{error}");
+    assert_eq!(command(&[]).0, 2);
 }

@@ -75,16 +75,16 @@ fn figures(report: &AttentionReport) -> Vec<(String, String, String)> {
         figures.push(("Integers and f32 agree".to_owned(), percent(agreement.keys_percent), note));
     }
     let networks = networks(report);
-    if let Some((label, network)) = networks.first() {
-        for (sensor, other, of) in [
-            ("Image", "LiDAR", (|n| n.statistics.image) as fn(&NetworkAttention) -> CrossModal),
-            ("LiDAR", "image", |n| n.statistics.lidar),
-        ] {
-            let beside =
-                networks.get(1).map(|(label, network)| format!("; {label} {}", percent(of(network).any_percent)));
-            let note = format!("of queries, {label}{}", beside.unwrap_or_default());
-            figures.push((format!("{sensor} looks at {other}"), percent(of(network).any_percent), note));
-        }
+    for (name, of) in [
+        ("Image looks at LiDAR", (|n| n.statistics.image) as fn(&NetworkAttention) -> CrossModal),
+        ("LiDAR looks at image", |n| n.statistics.lidar),
+    ] {
+        let any =
+            |(label, network): &(&str, &NetworkAttention)| format!("{label} {}", percent(of(network).any_percent));
+        let Some((_, network)) = networks.first() else { continue };
+        let each: Vec<String> = networks.iter().map(any).collect();
+        let note = format!("of queries with at least one of the {} strongest keys; {}", report.top, each.join(", "));
+        figures.push((name.to_owned(), percent(of(network).any_percent), note));
     }
     figures
 }
@@ -271,7 +271,6 @@ impl<'a> Stage<'a> {
                             path.key.only[only] fill-opacity=(opacity_text(opacity(heads, report.heads)))
                                 d=(self.outline(cells, 2.0)) {}
                         }
-                        path.halo d=(self.outline([token], 0.0)) {}
                         path.query d=(self.outline([token], 0.0)) {}
                         text x="0" y=(px(bottom + 18.0)) { (caption(query, token, keys, self.queries)) }
                     }
