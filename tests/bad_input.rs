@@ -223,7 +223,7 @@ fn checkpoints_that_are_attacks_or_no_checkpoints() {
     refused(
         &folder,
         quantize,
-        "@bad.pth: the tensor names are of no known system (1 tensors: fc.weight, …)\n  help: supported are checkpoints of aim, late_fusion and transfuser (2021); --system names one",
+        "@bad.pth: the tensor names are of no known system (1 tensors: fc.weight, …)\n  help: supported are checkpoints of aim, late_fusion, transfuser and geometric_fusion (2021); --system names one",
     );
     folder.write("bad.pth", folder.read("net.img"));
     refused(
@@ -503,7 +503,7 @@ fn words_of_the_command_line_that_mean_nothing() {
     refused(
         &folder,
         &compile("--system lbc"),
-        "@net.safetensors: this is a checkpoint of lbc, which is not supported\n  help: supported are aim, late_fusion and transfuser",
+        "@net.safetensors: this is a checkpoint of lbc, which is not supported\n  help: supported are aim, late_fusion, transfuser and geometric_fusion",
     );
     refused(
         &folder,
@@ -538,6 +538,7 @@ fn words_of_the_command_line_that_mean_nothing() {
         ("--skip 0,5", "invalid value '0,5' for '--skip <i8|i16|LIST>': found \"0,5\", "),
         ("--resolution 64", "invalid value '64' for '--resolution <HxW>': found \"64\", "),
         ("--ram 1G", "invalid value '1G' for '--ram <BYTES>': found '1G', "),
+        ("--fusion-scales 5", "invalid value '5' for '--fusion-scales <N>': "),
         ("--heads 0", "invalid value '0' for '--heads <HEADS>': "),
         ("--max-velocity nan", "invalid value 'nan' for '--max-velocity <M/S>': found \"nan\", "),
         ("--fast", "unexpected argument '--fast' found"),
@@ -561,6 +562,16 @@ fn words_of_the_command_line_that_mean_nothing() {
     assert_eq!(
         (status, &document["error"]["code"], &document["error"]["where"]),
         (2, &"usage".into(), &"command line".into())
+    );
+}
+
+#[test]
+fn fusion_scales_of_a_system_that_has_none_to_choose() {
+    let folder = project(System::TransFuser);
+    refused(
+        &folder,
+        &format!("{COMPILE} --fusion-scales 2"),
+        "@net.safetensors: --fusion-scales has no effect on transfuser\n  help: leave it out; the tensors of other systems tell their scales",
     );
 }
 

@@ -18,7 +18,7 @@ use model_compiler::quantize::{QuantizeOptions, SkipStages};
 use tests::build;
 use tests::golden::{self, Network};
 
-const SYSTEMS: [System; 3] = [System::Aim, System::LateFusion, System::TransFuser];
+const SYSTEMS: [System; 4] = [System::Aim, System::LateFusion, System::TransFuser, System::GeometricFusion];
 
 fn assert_byte_exact(compiled: &Compiled, frames: &[Frame], backend: Backend) {
     let bytes = AlignedBytes::from(compiled.image.as_slice());

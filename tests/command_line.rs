@@ -157,6 +157,23 @@ fn frame_folders_calibrate_run_and_verify() {
     assert_eq!(waypoints(&document, 0).len(), 8);
 }
 
+#[test]
+fn geometric_fusion_reads_frame_folders_and_any_number_of_fused_stages() {
+    let network = Network { grid: (8, 8), ..Network::small(System::GeometricFusion) };
+    let folder = Folder::of(&network);
+    let [all, four, two] = ["", " --fusion-scales 4", " --fusion-scales 2"].map(|options| proven(&folder, options, ""));
+    assert!(all == four && all != two);
+    for (i, frame) in build::frames(network.resolution()).iter().enumerate() {
+        commands::write_frame(&folder, &format!("{}/f{i}", if i < 3 { "train" } else { "test" }), frame);
+    }
+    folder.ok("model-compiler compile @net.safetensors --calib @train -o @net.img");
+    let (status, document) = folder.json("host-sim verify @net.img --model @net.safetensors --frames @test --json");
+    assert_eq!((status, &document["bytes_equal"]), (0, &true.into()));
+    let verified = waypoints(&document, 0);
+    let (_, document) = folder.json("host-sim run @net.img --frames @test --json");
+    assert_eq!(waypoints(&document, 0), verified, "the image alone tells how its frames are prepared");
+}
+
 /// Quantizes with options and returns the digest of the file; then proves the bytes of its image.
 fn proven(folder: &Folder, options: &str, compile_options: &str) -> Vec<u8> {
     let frames = "--calib @inputs.safetensors";

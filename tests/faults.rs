@@ -5,17 +5,16 @@ use firmware::fault::{self, Fault};
 use firmware::image::Image;
 use host_sim::cli::{self, Console};
 use model_compiler::emit::AlignedBytes;
-use model_compiler::frames::{ByteMap, Frame};
+use model_compiler::frames::Frame;
 use model_compiler::import::System;
 use model_compiler::ir::Graph;
 use model_compiler::pipeline::{self, Compiled};
 use model_compiler::quantize::{QuantizeOptions, SkipStages};
-use safetensors::tensor::{Dtype, TensorView};
 use serde_json::Value;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use tests::golden::Network;
-use tests::{build, every_step};
+use tests::{build, commands, every_step};
 
 /// Kinds of step at which a fault may first show: it depends on the network which of them comes first.
 fn expected_operators(fault: Fault) -> &'static [&'static str] {
@@ -39,6 +38,7 @@ fn expected_operators(fault: Fault) -> &'static [&'static str] {
         Fault::PoolSecondMap => &["global_pool"],
         Fault::BoxOffset | Fault::BorderZero => &["copy_box"],
         Fault::ConcatOrder => &["concat"],
+        Fault::GatherTransposed => &["gather_sum"],
     }
 }
 
@@ -104,7 +104,7 @@ impl Subject {
             inputs: folder.join(format!("{name}.safetensors")),
         };
         pipeline::write(compiled, &subject.image).unwrap_or_else(|e| panic!("{e}"));
-        write_inputs(&subject.inputs, frames);
+        std::fs::write(&subject.inputs, commands::inputs_file(frames)).unwrap_or_else(|e| panic!("{e}"));
         subject
     }
 
@@ -181,32 +181,4 @@ impl std::fmt::Display for Outcome {
             None => write!(f, "status {}: {}", self.status, self.document["error"]["message"]),
         }
     }
-}
-
-/// The frames as a file of network inputs.
-fn write_inputs(path: &Path, frames: &[Frame]) {
-    let planes = |map: &Option<ByteMap>| {
-        let ByteMap { shape, data } = map.as_ref().expect("a map");
-        let channels = usize::from(shape.channels);
-        let plane = |c: usize| data.iter().skip(c).step_by(channels).copied().collect::<Vec<u8>>();
-        (0..channels).flat_map(plane).collect::<Vec<u8>>()
-    };
-    let shape = |map: &Option<ByteMap>| {
-        let shape = map.as_ref().expect("a map").shape;
-        vec![frames.len(), shape.channels.into(), shape.height.into(), shape.width.into()]
-    };
-    let floats = |values: Vec<f64>| values.iter().flat_map(|v| (*v as f32).to_le_bytes()).collect::<Vec<u8>>();
-    let rgb: Vec<u8> = frames.iter().flat_map(|frame| planes(&frame.rgb)).collect();
-    let bev: Vec<u8> = frames.iter().flat_map(|frame| planes(&frame.bev)).collect();
-    let velocity = floats(frames.iter().filter_map(|frame| frame.velocity).collect());
-    let target = floats(frames.iter().filter_map(|frame| frame.goal).flatten().collect());
-    let view = |element, shape, data| TensorView::new(element, shape, data).expect("a tensor");
-    let tensors = [
-        ("rgb", view(Dtype::U8, shape(&frames[0].rgb), &rgb)),
-        ("bev", view(Dtype::U8, shape(&frames[0].bev), &bev)),
-        ("velocity", view(Dtype::F32, vec![frames.len()], &velocity)),
-        ("target", view(Dtype::F32, vec![frames.len(), 2], &target)),
-    ];
-    let bytes = safetensors::serialize(tensors, None).expect("serializable");
-    std::fs::write(path, bytes).unwrap_or_else(|e| panic!("{}: {e}", path.display()));
 }

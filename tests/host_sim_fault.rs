@@ -1,4 +1,4 @@
-//! The comparison can fail: an engine with a named fault is caught by `verify`.
+//! The comparison can fail: an engine with a named fault is caught by `verify`, and by `attention` in its block.
 //!
 //! One test, for a fault is switched on for the whole process.
 
@@ -6,7 +6,7 @@ use model_compiler::import::System;
 use tests::project::Project;
 
 #[test]
-fn verify_catches_an_engine_with_a_fault() {
+fn commands_catch_an_engine_with_a_fault() {
     let project = Project::new(System::TransFuser);
     let command = "verify net.img --inputs inputs.safetensors";
     assert_eq!(project.host_sim(command).status, 0);
@@ -25,6 +25,13 @@ fn verify_catches_an_engine_with_a_fault() {
         let position = report["first_difference"]["position"].as_u64().unwrap() as usize;
         assert_eq!(report["steps"][position]["op"], op, "{fault} shows first where it acts");
     }
+    let attention = project.host_sim("attention net.img --inputs inputs.safetensors --fault SoftmaxMaximum");
+    assert_eq!(attention.status, 1);
+    assert!(
+        attention.err.contains("the engine's context is not what queries, keys and values give"),
+        "{}",
+        attention.err
+    );
     let vectors = project.host_sim(&format!("{command} --backend avx2 --fault DepthTail"));
     assert_eq!(vectors.status, 2);
     assert!(vectors.err.contains("--fault: the kernels of avx2 hold no faults"), "{}", vectors.err);

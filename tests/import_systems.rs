@@ -33,6 +33,8 @@ fn published_checkpoints_have_the_published_sizes() {
         (System::Aim, 21_470_722, 4.785),
         (System::LateFusion, 32_644_098, 7.102),
         (System::TransFuser, 66_293_634, 11.632),
+        // Of 40,919,554 without image_projection2 and lidar_conv4; of 8.512 G without lidar_conv4.
+        (System::GeometricFusion, 39_868_930, 8.495),
     ] {
         let mut graph = import_default(golden::checkpoint(system));
         assert_eq!(graph.system, system.name());
@@ -48,7 +50,8 @@ fn published_checkpoints_have_the_published_sizes() {
             }
             if !optimized {
                 optimize(&mut graph).unwrap_or_else(|e| panic!("{e}"));
-                assert_eq!(graph.macs(), macs, "folding and fusing leaves the products as they are");
+                let saved = if system == System::GeometricFusion { 880_803_840 } else { 0 };
+                assert_eq!(graph.macs() + saved, macs, "only pointwise convolutions change places and are cheaper");
             }
         }
     }
@@ -134,6 +137,7 @@ fn inputs_and_outputs_have_their_names() {
         (System::Aim, vec!["rgb", "goal"]),
         (System::LateFusion, vec!["rgb", "bev", "goal"]),
         (System::TransFuser, vec!["rgb", "bev", "velocity", "goal"]),
+        (System::GeometricFusion, vec!["rgb", "bev", "bev_points", "cam_points", "goal"]),
     ] {
         let network = Network::small(system);
         let options = ImportOptions { resolution: Some(network.resolution()), ..Default::default() };
@@ -180,6 +184,128 @@ fn optimized_transfuser_consists_of_fused_operators() {
     let image = normalized("encoder.image_encoder.features.relu").expect("raw camera image");
     assert_eq!((&image.mean[..], &image.std[..]), (&[0.485, 0.456, 0.406][..], &[0.229, 0.224, 0.225][..]));
     assert_eq!(normalized("encoder.lidar_encoder._model.relu"), None, "counts are scaled by their input");
+}
+
+#[test]
+fn optimized_geometric_fusion_runs_its_pointwise_convolutions_on_the_smallest_maps() {
+    let mut graph = import_default(Network::published(System::GeometricFusion).zeros());
+    assert_eq!(mega_macs(&graph, "encoder.image_conv1"), 134.22);
+    optimize(&mut graph).unwrap();
+    for (operator, expected) in [
+        // Both networks, seven embeddings, eight ways back.
+        ("conv2d", 36 + 20 + 7 + 8),
+        ("average_pool", 6),
+        ("gather_sum", 8),
+        ("linear", 8 * 3 + 3),
+        ("relu", 0),
+        ("resize_bilinear", 6),
+        ("add", 0),
+    ] {
+        assert_eq!(count(&graph, operator), expected, "{operator}");
+    }
+    let grid = (8, 8);
+    for node in graph.nodes.iter().filter(|n| ["average_pool", "gather_sum"].contains(&n.op.name())) {
+        let shape = graph.value(node.output).shape;
+        assert_eq!((shape.height, shape.width), grid, "{}", node.name);
+    }
+    for node in graph.nodes.iter().filter(|n| n.op.name() == "resize_bilinear") {
+        assert_eq!(node.inputs.len(), 2, "{} is added on the way", node.name);
+        let deconv = graph.producer(node.inputs[0]).unwrap();
+        assert_eq!(deconv.op.name(), "conv2d", "{}", node.name);
+        assert_eq!(graph.value(deconv.output).shape.channels, graph.value(node.output).shape.channels);
+    }
+    // 64 cells × 512 channels × the stage's.
+    for (name, expected) in [
+        ("encoder.image_embedding1", 2.10),
+        ("encoder.lidar_embedding2", 4.19),
+        ("encoder.image_embedding3", 8.39),
+        ("encoder.image_conv4", 16.78),
+        ("encoder.lidar_upsample1.input", 2.10),
+        ("encoder.image_upsample3.input", 8.39),
+        ("encoder.lidar_add4", 16.78),
+    ] {
+        assert_eq!(mega_macs(&graph, name), expected, "{name}");
+    }
+}
+
+/// Names of the values that the node of this name reads.
+fn reads<'a>(graph: &'a Graph, name: &str) -> Vec<&'a str> {
+    let node = graph.nodes.iter().find(|n| n.name == name).unwrap_or_else(|| panic!("no node {name}"));
+    node.inputs.iter().map(|&id| graph.value(id).name.as_str()).collect()
+}
+
+#[test]
+fn geometric_fusion_keeps_what_its_weights_were_trained_with() {
+    let graph = import_default(Network::small(System::GeometricFusion).tensors());
+    assert_eq!(reads(&graph, "encoder.image_gathered2"), ["encoder.image_embedding2", "bev_points"]);
+    assert_eq!(reads(&graph, "encoder.image_projection1.0.scale2"), ["encoder.image_gathered2"]);
+    assert!(graph.nodes.iter().all(|n| !n.name.starts_with("encoder.image_projection2")), "scale 2 uses the first");
+    assert_eq!(reads(&graph, "encoder.lidar_gathered4"), ["encoder.lidar_embedding3", "cam_points"]);
+    assert!(graph.find("encoder.lidar_conv4").is_none(), "scale 4 gathers scale 3");
+    assert_eq!(reads(&graph, "encoder.image_gathered4"), ["encoder.image_conv4", "bev_points"]);
+    // Both embeddings are of the maps before either gets anything.
+    assert_eq!(reads(&graph, "encoder.lidar_conv1"), ["encoder.lidar_encoder._model.layer1.0"]);
+    assert_eq!(reads(&graph, "encoder.image_conv1"), ["encoder.image_encoder.features.layer1.1"]);
+    assert_eq!(reads(&graph, "encoder.lidar_upsample1"), ["encoder.image_projection1.5"]);
+    let names = ["encoder.image_projection1.0", "encoder.image_projection1.0.scale2"];
+    let weights = names.map(|name| match &graph.producer(graph.find(name).unwrap()).unwrap().op {
+        Op::Linear(linear) => linear.weights.data.as_ptr(),
+        op => panic!("{name} is a {}", op.name()),
+    });
+    assert_eq!(weights[0], weights[1], "shared");
+}
+
+#[test]
+fn geometric_fusion_fuses_as_many_of_the_last_stages_as_it_is_told() {
+    let tensors = Network::small(System::GeometricFusion).tensors();
+    for scales in 1..=4 {
+        let options = ImportOptions { fusion_scales: Some(scales), ..Default::default() };
+        let mut graph = import("m", tensors.clone(), &options).unwrap();
+        assert_eq!(verify(&graph), Ok(()));
+        assert_eq!(count(&graph, "gather_sum"), 2 * usize::from(scales));
+        let fourth = if scales == 1 { "encoder.lidar_conv4" } else { "encoder.lidar_embedding3" };
+        assert_eq!(reads(&graph, "encoder.lidar_gathered4")[0], fourth, "{scales} scales");
+        optimize(&mut graph).unwrap();
+    }
+    let options = ImportOptions { fusion_scales: Some(2), ..Default::default() };
+    let error = import("m", Network::small(System::TransFuser).tensors(), &options).unwrap_err();
+    assert_eq!(error.code, ErrorCode::Usage);
+    assert_eq!(
+        error.to_string(),
+        "m: --fusion-scales has no effect on transfuser\n  \
+         help: leave it out; the tensors of other systems tell their scales"
+    );
+}
+
+#[test]
+fn sizes_of_geometric_fusion_come_from_the_tensors() {
+    let network = Network {
+        widths: [8, 16, 20, 28],
+        image_blocks: [1, 3, 2, 1],
+        embedding: 10,
+        projection: vec![6, 14],
+        gru_inputs: 4,
+        ..Network::small(System::GeometricFusion)
+    };
+    let options = ImportOptions { resolution: Some((96, 96)), ..Default::default() };
+    let graph = import("m", network.tensors(), &options).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(shape_of(&graph, "cam_points"), Shape::map(3, 3, 10));
+    assert_eq!(shape_of(&graph, "encoder.image_conv2"), Shape::map(12, 12, 10));
+    assert_eq!(shape_of(&graph, "encoder.lidar_embedding2"), Shape::map(3, 3, 10));
+    assert_eq!(shape_of(&graph, "encoder.lidar_projection2.3"), Shape::map(3, 3, 14));
+    assert_eq!(shape_of(&graph, "encoder.image_add2"), Shape::map(12, 12, 16));
+    let mut tensors = network.tensors();
+    tensors.insert("encoder.image_projection2.0.weight", floats(&[6, 11]));
+    tensors.remove("encoder.lidar_conv4.bias");
+    tensors.insert("encoder.lidar_deconv1.weight", floats(&[8, 14, 3, 3]));
+    let error = import("model.pth", tensors, &options).unwrap_err();
+    let expected = "\
+model.pth: 3 tensors do not fit the system geometric_fusion:
+  encoder.image_projection2.0.weight  found [6, 11]        expected [6, 10]
+  encoder.lidar_deconv1.weight        found [8, 14, 3, 3]  expected [8, 14, 1, 1]
+  encoder.lidar_conv4.bias            missing              expected [10]
+  help: the checkpoint must hold exactly the network's tensors; --system overrides the detection";
+    assert_eq!(error.to_string(), expected);
 }
 
 #[test]
@@ -273,6 +399,14 @@ fn unfitting_options_are_refused_by_name() {
         error.to_string(),
         "m: an input of 72×64 pixels does not divide into tokens\n  \
          help: height and width must be multiples of 32 pixels"
+    );
+    let tensors = Network::small(System::GeometricFusion).tensors();
+    let resolution = ImportOptions { resolution: Some((64, 96)), ..Default::default() };
+    let error = import("m", tensors, &resolution).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "m: an input of 64×96 pixels is not square\n  \
+         help: this network takes columns of the image for rows, so it needs as many of both"
     );
 }
 

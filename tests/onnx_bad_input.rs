@@ -209,6 +209,10 @@ fn options_that_do_not_fit() {
             "@net.onnx: input image: found a fixed size of 8 pixels, but --resolution says 9\n  help: leave --resolution out, or export the network with a dynamic size",
         ),
         (" --system aim", "@net.onnx: --system has no effect on an ONNX file\n  help: leave --system out"),
+        (
+            " --fusion-scales 4",
+            "@net.onnx: --fusion-scales has no effect on an ONNX file\n  help: leave --fusion-scales out",
+        ),
         (" --heads 4", "@net.onnx: --heads has no effect on an ONNX file\n  help: leave --heads out"),
         (
             " --mean 1,2 --std 1",

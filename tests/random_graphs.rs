@@ -26,7 +26,7 @@ const LOCAL_FLOOR_DB: f64 = 28.0;
 const FLOOR_DB: f64 = 15.0;
 
 /// Operators that must occur.
-const OPERATORS: [&str; 11] = [
+const OPERATORS: [&str; 12] = [
     "conv2d",
     "linear",
     "max_pool",
@@ -38,6 +38,7 @@ const OPERATORS: [&str; 11] = [
     "copy_box",
     "concat",
     "softmax",
+    "gather_sum",
 ];
 
 /// A network of a seed, compiled with options that alternate.

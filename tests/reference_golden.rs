@@ -22,6 +22,8 @@ fn raw_inputs(graph: &Graph, frame: &Frame) -> Vec<Vec<f32>> {
         InputKind::Bev => frame.bev.clone(),
         InputKind::Velocity => vec![frame.velocity],
         InputKind::Goal => frame.target.to_vec(),
+        InputKind::BevPoints => frame.bev_points.clone(),
+        InputKind::CameraPoints => frame.camera_points.clone(),
     };
     graph.inputs().map(|(_, kind)| raw(kind)).collect()
 }
@@ -105,4 +107,9 @@ fn late_fusion_meets_the_original() {
 #[test]
 fn transfuser_meets_the_original() {
     meets_the_original(System::TransFuser);
+}
+
+#[test]
+fn geometric_fusion_meets_the_original() {
+    meets_the_original(System::GeometricFusion);
 }

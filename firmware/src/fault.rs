@@ -60,11 +60,13 @@ pub enum Fault {
     BorderZero,
     /// The operands of a concatenation are exchanged.
     ConcatOrder,
+    /// Gathered cells are addressed by column and row.
+    GatherTransposed,
 }
 
 impl Fault {
     /// All faults, for tests and `--fault NAME`.
-    pub const ALL: [Fault; 26] = [
+    pub const ALL: [Fault; 27] = [
         Self::TieDown,
         Self::TieAwayFromZero,
         Self::DoubleRounding,
@@ -91,6 +93,7 @@ impl Fault {
         Self::BoxOffset,
         Self::BorderZero,
         Self::ConcatOrder,
+        Self::GatherTransposed,
     ];
 }
 

@@ -290,6 +290,19 @@ pub struct SoftmaxArgs<'a> {
     pub exp_table: &'a [i16],
 }
 
+/// Arguments of [`Kernels::gather_sum`]; see [`crate::program::GatherSum`].
+#[derive(Clone, Copy, Debug)]
+pub struct GatherSumArgs<'a> {
+    /// Input shape.
+    pub input_shape: Shape,
+    /// Output shape.
+    pub output_shape: Shape,
+    /// Row and column of each cell, as many pairs for every output position.
+    pub indices: &'a [i8],
+    /// From the sum to the output's scale.
+    pub requant: RequantArgs,
+}
+
 /// One method per operator; see the module page. Operand layouts are those of [`crate::tensor`].
 pub trait Kernels {
     /// The kernels that this backend can read.
@@ -386,6 +399,11 @@ pub trait Kernels {
     fn softmax(&self, args: &SoftmaxArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
         portable::softmax::softmax(args, input, output);
     }
+
+    /// Sums of gathered cells of a map.
+    fn gather_sum(&self, args: &GatherSumArgs<'_>, input: Codes<'_>, output: CodesMut<'_>) {
+        portable::gather_sum::gather_sum(args, input, output);
+    }
 }
 
 /// A borrowed backend is one: every method goes to the backend behind the reference.
@@ -467,6 +485,10 @@ impl<K: Kernels + ?Sized> Kernels for &K {
 
     fn softmax(&self, args: &SoftmaxArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
         (**self).softmax(args, input, output);
+    }
+
+    fn gather_sum(&self, args: &GatherSumArgs<'_>, input: Codes<'_>, output: CodesMut<'_>) {
+        (**self).gather_sum(args, input, output);
     }
 }
 

@@ -66,5 +66,6 @@ pub mod image;
 pub mod kernels;
 pub mod ops;
 pub mod program;
+pub mod sensors;
 pub mod tensor;
 pub mod waypoint;

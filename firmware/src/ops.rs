@@ -30,6 +30,7 @@ mod concat;
 mod context;
 mod conv2d;
 mod copy_box;
+mod gather_sum;
 mod global_pool;
 mod layer_norm;
 mod linear;
@@ -63,6 +64,7 @@ pub(crate) fn validate(step: &Step, context: &StepContext<'_, '_>) -> Result<u64
         Step::CopyBox(step) => copy_box::validate(step, context),
         Step::Concat(step) => concat::validate(step, context),
         Step::Softmax(step) => softmax::validate(step, context),
+        Step::GatherSum(step) => gather_sum::validate(step, context),
     }
 }
 
@@ -94,6 +96,7 @@ pub(crate) fn run<K: Kernels>(
         Step::CopyBox(step) => copy_box::run(step, &context, kernels, operands),
         Step::Concat(step) => concat::run(step, &context, kernels, operands),
         Step::Softmax(step) => softmax::run(step, &context, kernels, operands),
+        Step::GatherSum(step) => gather_sum::run(step, &context, kernels, operands),
     }
 }
 

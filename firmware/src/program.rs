@@ -505,6 +505,28 @@ pub struct Softmax {
     pub exp_table: ConstRange,
 }
 
+/// Sums of gathered cells: `y_ijc = clamp(z_o + R(Σ_k (q[p_ijk]_c − z)·M, n))`.
+///
+/// `p_ijk` is the cell (row `indices[i,j,2k]`, column `indices[i,j,2k+1]`) of the map, k = 0 .. K; an index outside the map
+/// means the nearest row or column. A cell may occur several times.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct GatherSum {
+    /// i8 or i16 map `H×W×C`.
+    pub input: TensorId,
+    /// i8 map `OH×OW×2K`: a row and a column per cell, plain numbers.
+    pub indices: TensorId,
+    /// i8 or i16 map `OH×OW×C`.
+    pub output: TensorId,
+    /// `z`.
+    pub input_zero_point: i16,
+    /// `M = s_x / s_o` and n.
+    pub requant: Requant,
+    /// `z_o`.
+    pub zero_point: i16,
+    /// Bounds of the output code.
+    pub clamp: Clamp,
+}
+
 /// One operator of the program, in the order of execution.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant, reason = "decoded one at a time on the stack, never stored in bulk on the target")]
@@ -525,6 +547,7 @@ pub enum Step {
     CopyBox(CopyBox),
     Concat(Concat),
     Softmax(Softmax),
+    GatherSum(GatherSum),
 }
 
 impl Rescale {
@@ -539,7 +562,7 @@ impl Rescale {
 
 impl Step {
     /// Union of the feature bits of all step kinds and kernels of this format.
-    pub const KNOWN_FEATURES: u64 = ((1 << 15) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
+    pub const KNOWN_FEATURES: u64 = ((1 << 16) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
 
     /// Operator name as reports print it.
     pub const fn name(&self) -> &'static str {
@@ -559,6 +582,7 @@ impl Step {
             Self::CopyBox(_) => "copy_box",
             Self::Concat(_) => "concat",
             Self::Softmax(_) => "softmax",
+            Self::GatherSum(_) => "gather_sum",
         }
     }
 
@@ -580,6 +604,7 @@ impl Step {
             Self::CopyBox(_) => 12,
             Self::Concat(_) => 13,
             Self::Softmax(_) => 14,
+            Self::GatherSum(_) => 15,
         }
     }
 
@@ -601,6 +626,7 @@ impl Step {
             Self::CopyBox(s) => s.output,
             Self::Concat(s) => s.output,
             Self::Softmax(s) => s.output,
+            Self::GatherSum(s) => s.output,
         }
     }
 
@@ -642,6 +668,7 @@ impl Step {
             Self::CopyBox(s) => [Some(s.input), None, None],
             Self::Concat(s) => [Some(s.first.tensor), Some(s.second.tensor), None],
             Self::Softmax(s) => [Some(s.input), None, None],
+            Self::GatherSum(s) => [Some(s.input), Some(s.indices), None],
         }
     }
 

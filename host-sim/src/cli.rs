@@ -1,5 +1,5 @@
-//! The command line: `run`, `verify`, `diff`, `ablate`, `bench`, `schema`, `completions`, and the demo without any of
-//! them.
+//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `score`, `bench`, `schema`, `completions`, and the
+//! demo without any of them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
@@ -10,7 +10,8 @@ use crate::files::FrameSource;
 use crate::gates::{self, Gates};
 use crate::noise::{self, Selection};
 use crate::report::{self, VerifyReport, html, json, terminal};
-use crate::{bench, demo, run, verify};
+use crate::{attention, bench, demo, metrics, run, verify};
+use attention_args::AttentionArgs;
 use clap::{Args, Parser, Subcommand};
 use indicatif::ProgressBar;
 use model_compiler::artifact;
@@ -20,6 +21,7 @@ use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
+mod attention_args;
 mod examples;
 
 pub use model_compiler::cli::Console;
@@ -109,6 +111,41 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
+    /// How often tokens of one sensor attend to the other in a fusing transformer: integers, f32, and how far they agree.
+    #[command(after_help = examples::ATTENTION)]
+    Attention {
+        /// Model image (OUT.img), or a checkpoint for its f32 network alone.
+        #[arg(value_name = "OUT.img|MODEL")]
+        model: PathBuf,
+        /// The checkpoint that the image was compiled from; without it only the integers are looked at.
+        #[arg(long = "model", value_name = "MODEL")]
+        checkpoint: Option<PathBuf>,
+        #[command(flatten)]
+        import: ImportArgs,
+        #[command(flatten)]
+        frames: FrameSource,
+        #[command(flatten)]
+        backend: BackendArgs,
+        /// Build record of the image, for the names of its blocks [default: OUT.record beside OUT.img, if it is there].
+        #[arg(long, value_name = "FILE")]
+        record: Option<PathBuf>,
+        #[command(flatten)]
+        attention: AttentionArgs,
+        /// Write attention.html and attention.json to this folder.
+        #[arg(long, value_name = "DIR")]
+        report: Option<PathBuf>,
+        #[command(flatten)]
+        common: Common,
+    },
+    /// Driving score, route completion and infractions of logged drives.
+    #[command(after_help = examples::SCORE)]
+    Score {
+        /// Logs, one route each (`host-sim schema route-log` prints the format).
+        #[arg(value_name = "LOG.json", required = true)]
+        logs: Vec<PathBuf>,
+        #[command(flatten)]
+        common: Common,
+    },
     /// What changed from one report of a verification to another, without running anything.
     #[command(after_help = examples::DIFF)]
     Diff {
@@ -127,9 +164,12 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
-    /// JSON Schema of the report that `verify --json` and report.json hold.
+    /// JSON Schema of a document: of the report that `verify --json` and report.json hold, or another.
     #[command(after_help = examples::SCHEMA)]
     Schema {
+        /// Which document.
+        #[arg(value_name = "DOCUMENT", default_value = "verify")]
+        document: json::Document,
         #[command(flatten)]
         common: Common,
     },
@@ -316,7 +356,9 @@ impl Command {
             | Self::Ablate { common, .. }
             | Self::Bench { common, .. }
             | Self::Diff { common, .. }
-            | Self::Schema { common } => Some(common),
+            | Self::Attention { common, .. }
+            | Self::Score { common, .. }
+            | Self::Schema { common, .. } => Some(common),
             Self::Completions(_) => None,
         }
     }
@@ -363,12 +405,32 @@ impl Command {
                 console.print(&if common.json { json::ablation(&rows).to_string() } else { terminal::ablation(&rows) });
                 Ok(0)
             }
+            Self::Attention { model, checkpoint, import, frames, backend, record, attention: args, report, common } => {
+                let (import, backend) = (import.options()?, backend.choose(&common)?);
+                let (block, rows, top) = (args.block.clone(), args.rows(), args.top);
+                let options =
+                    attention::Options { model, checkpoint, record, import, frames, backend, block, rows, top };
+                let measured = attention::attention(&options, progress)?;
+                if let Some(folder) = &report {
+                    report::write_attention(folder, &measured)?;
+                }
+                let report = measured.report;
+                warn_of_calibration(&report.calibration_frames, report.frames.len(), console);
+                let text = || terminal::attention(&report);
+                console.print(&if common.json { json::attention(&report).to_string() } else { text() });
+                Ok(0)
+            }
+            Self::Score { logs, common } => {
+                let score = metrics::score(&logs)?;
+                console.print(&if common.json { json::score(&score).to_string() } else { terminal::score(&score) });
+                Ok(0)
+            }
             Self::Diff { old, new, max_loss, report, common } => {
                 let diff = Diff::between(&json::read(&old)?, &json::read(&new)?)?;
                 compare(&diff, max_loss, report.as_deref(), common.json, console)
             }
-            Self::Schema { .. } => {
-                console.print(&format!("{:#}", json::schema()));
+            Self::Schema { document, .. } => {
+                console.print(&format!("{:#}", json::schema(document)));
                 Ok(0)
             }
             Self::Bench { image, bench: args, common } => {
@@ -455,17 +517,20 @@ impl Common {
 
 /// What a reader of the figures must know first.
 fn warn(report: &VerifyReport, console: &mut Console<'_>) {
-    if !report.calibration_frames.is_empty() {
-        console.complain(&format!(
-            "warning: {} of {} frames are also calibration frames, so figures against f32 flatter: {}",
-            report.calibration_frames.len(),
-            report.frames.len(),
-            report.calibration_frames.join(", ")
-        ));
-    }
+    warn_of_calibration(&report.calibration_frames, report.frames.len(), console);
     for frame in report.frames.iter().filter(|frame| frame.dropped_points > 0) {
         let (name, points) = (&frame.name, frame.dropped_points);
         console.complain(&format!("warning: frame {name}: {points} LiDAR points are not finite and were left out"));
+    }
+}
+
+fn warn_of_calibration(known: &[String], frames: usize, console: &mut Console<'_>) {
+    if !known.is_empty() {
+        console.complain(&format!(
+            "warning: {} of {frames} frames are also calibration frames, so figures against f32 flatter: {}",
+            known.len(),
+            known.join(", ")
+        ));
     }
 }
 

@@ -54,7 +54,8 @@ fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
         | QOp::Tokens { clamp, zero_point, .. }
         | QOp::LayerNorm { clamp, zero_point, .. }
         | QOp::Attention { clamp, zero_point, .. }
-        | QOp::Concat { clamp, zero_point, .. } => Some((*clamp, *zero_point)),
+        | QOp::Concat { clamp, zero_point, .. }
+        | QOp::GatherSum { clamp, zero_point, .. } => Some((*clamp, *zero_point)),
         QOp::MaxPool { .. } | QOp::CopyBox { .. } | QOp::Softmax { .. } | QOp::WaypointDecoder(_) => None,
     }
 }

@@ -177,9 +177,14 @@ pub fn frame_format(image: &Image<'_>) -> Result<FrameFormat> {
     let inputs = ports.filter_map(|port| Some((port, shape(port.tensor)?)));
     let inputs = inputs.map(|(port, shape)| Ok((input_kind(&port)?, shape))).collect::<Result<Vec<_>>>()?;
     // The height that splits the histogram is not in the image; of the systems with a histogram only TransFuser
-    // reads the speed.
-    let reads_speed = inputs.iter().any(|(kind, _)| *kind == InputKind::Velocity);
-    let format = FrameFormat::new(if reads_speed { "transfuser" } else { "late_fusion" }, inputs);
+    // reads the speed, and only Geometric Fusion cells to gather.
+    let reads = |wanted| inputs.iter().any(|(kind, _)| *kind == wanted);
+    let system = match (reads(InputKind::Velocity), reads(InputKind::BevPoints)) {
+        (true, _) => "transfuser",
+        (false, true) => "geometric_fusion",
+        (false, false) => "late_fusion",
+    };
+    let format = FrameFormat::new(system, inputs);
     let name = image.input(0).map_or("", |port| port.name);
     Ok(format.with_output(name, image.output(0).and_then(|port| shape(port.tensor))))
 }
@@ -190,8 +195,7 @@ pub fn frame_format(image: &Image<'_>) -> Result<FrameFormat> {
 /// # Errors
 /// The name is unknown, and it is no image.
 pub fn input_kind(port: &Port<'_>) -> Result<InputKind> {
-    let kinds = [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal];
-    let named = kinds.into_iter().find(|&kind| frames::input_name(kind) == port.name);
+    let named = frames::INPUT_KINDS.into_iter().find(|&kind| frames::input_name(kind) == port.name);
     let is_image = port.scale == 1.0 && port.zero_point == -128;
     named.or(is_image.then_some(InputKind::Image)).ok_or_else(|| {
         Error::new(ErrorCode::Unsupported, format!("input `{}`", port.name), "no sensor gives this input")

@@ -6,6 +6,8 @@
 //! * [`run`]: waypoints or classes of frames, int8 from an image or f32 from a checkpoint
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
 //!   f32 network: how much precision each step costs
+//! * [`attention`]: how often the fusing transformer looks from one sensor to the other, in integers and in f32
+//! * [`metrics`]: how well a car drove, from the logs of whole routes
 //! * [`report`]: what was found, as text, JSON and one HTML page; [`diff`] against an earlier report, [`gates`] for CI,
 //!   and where the noise at the output comes from ([`noise`])
 //!
@@ -19,6 +21,7 @@
 #![forbid(unsafe_code)]
 
 pub mod ablation;
+pub mod attention;
 pub mod backends;
 pub mod bench;
 pub mod buffers;
@@ -32,6 +35,7 @@ pub mod diff;
 pub mod files;
 pub mod gates;
 pub mod histogram;
+pub mod metrics;
 pub mod noise;
 pub mod report;
 pub mod run;

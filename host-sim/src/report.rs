@@ -1,13 +1,14 @@
 //! What a verification found: the structure, and its forms for people ([`terminal`], [`html`]) and machines ([`json`]).
 //!
 //! The JSON document of `host-sim verify --json`, of `report.json` and of the demo is [`VerifyReport`], field for field;
-//! `host-sim schema` prints its JSON Schema. Rules that hold everywhere:
+//! `host-sim schema` prints its JSON Schema, and those of other documents by name. Rules that hold everywhere:
 //!
 //! * SQNR is `10·log10(Σ ref² / Σ (ref − test)²)` in dB, from sums over all frames
 //! * a figure that was not measured is `null`, and so is one that is infinite: where `sqnr_db` is `null` and `cosine` is
 //!   not, nothing differed at all; the same for `local_sqnr_db` with `max_error_lsb`
 //! * steps stand in the order of execution; a step is known by its name, which is unique
 
+use crate::attention::Measured;
 use crate::channels::Channels;
 use crate::classification::{ClassificationSummary, ClassifiedFrame};
 use crate::compare::StepDifference;
@@ -243,6 +244,20 @@ pub fn write(folder: &Path, report: &VerifyReport, frames: &[Frame]) -> Result<(
     let page = html::page(report, frames);
     let document = json::bytes(&json::verify(report));
     artifact::write_files(&[(&folder.join("report.html"), page.as_bytes()), (&folder.join("report.json"), &document)])
+}
+
+/// Writes `attention.html` and `attention.json` to a folder, which is made where it does not exist.
+///
+/// # Errors
+/// The folder cannot be written; then neither file is there without the other.
+pub fn write_attention(folder: &Path, measured: &Measured) -> Result<()> {
+    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, &e))?;
+    let page = html::attention_page(&measured.report, &measured.frames);
+    let document = json::bytes(&json::attention(&measured.report));
+    artifact::write_files(&[
+        (&folder.join("attention.html"), page.as_bytes()),
+        (&folder.join("attention.json"), &document),
+    ])
 }
 
 /// The step with the lowest accumulated SQNR; one that is not a number is lowest of all.

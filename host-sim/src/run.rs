@@ -7,6 +7,7 @@ use crate::codes::decode;
 use crate::files::{self, FrameSource, ImageFile};
 use firmware::engine::{Engine, EngineError};
 use firmware::image::{Image, Port, TensorRecord};
+use firmware::program::Step;
 use firmware::tensor::ElementType;
 use indicatif::ProgressBar;
 use model_compiler::artifact;
@@ -185,7 +186,7 @@ pub fn waypoints<T: Copy + Into<f64>>(values: &[T]) -> Waypoints {
 }
 
 /// An image with its working memory and its first output.
-struct Device<'a> {
+pub(crate) struct Device<'a> {
     image: Image<'a>,
     backend: Backend,
     arena: GuardedArena,
@@ -194,7 +195,7 @@ struct Device<'a> {
 }
 
 impl<'a> Device<'a> {
-    fn new(image: Image<'a>, backend: Backend) -> Result<Self> {
+    pub(crate) fn new(image: Image<'a>, backend: Backend) -> Result<Self> {
         let port = image.output(0).and_then(|port| Some((port, image.tensor(port.tensor)?)));
         let (port, record) = port.ok_or_else(|| {
             Error::new(ErrorCode::Unsupported, format!("network {}", image.name()), "it has no output")
@@ -205,11 +206,20 @@ impl<'a> Device<'a> {
 
     /// Real values of the first output.
     fn infer(&mut self, frame: &Frame) -> Result<Vec<f64>> {
+        self.infer_observed(frame, |_, _, _| ())
+    }
+
+    /// The same; `observe` sees every step with its position and output bytes.
+    pub(crate) fn infer_observed(
+        &mut self,
+        frame: &Frame,
+        observe: impl FnMut(usize, &Step, &[u8]),
+    ) -> Result<Vec<f64>> {
         let inputs = self.input_bytes(frame)?;
         let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
         let refuse = |e: EngineError| Error::new(ErrorCode::Malformed, "engine", e.to_string());
         let mut engine = Engine::new(self.image, self.backend.kernels(), self.arena.poisoned(0)).map_err(refuse)?;
-        engine.infer(&inputs).map_err(refuse)?;
+        engine.infer_observed(&inputs, observe).map_err(refuse)?;
         let codes = decode(engine.output(0).map_err(refuse)?, self.record.element);
         let real = |&code: &i32| (f64::from(code) - f64::from(self.port.zero_point)) * f64::from(self.port.scale);
         Ok(codes.iter().map(real).collect())

@@ -172,7 +172,8 @@ fn compare_and_measure(
     })
 }
 
-fn calibration_digests(model: &QModel) -> Vec<&str> {
+/// How the frames that a model was calibrated on are known.
+pub(crate) fn calibration_digests(model: &QModel) -> Vec<&str> {
     let digests = model.provenance.iter().find(|(key, _)| key == "calibration_frames");
     digests.map(|(_, digests)| digests.split(',').map(str::trim).collect()).unwrap_or_default()
 }

@@ -118,6 +118,9 @@ pub struct ImportArgs {
     /// Attention heads of a checkpoint (no tensor tells) [default: 4].
     #[arg(long, value_parser = clap::value_parser!(u16).range(1..))]
     heads: Option<u16>,
+    /// Stages that a Geometric Fusion checkpoint fuses, counted from the last (no tensor tells) [default: 4].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=4))]
+    fusion_scales: Option<u8>,
     /// Height and width of the network's image and BEV inputs; told from the file where it tells it, else 256x256 for
     /// a checkpoint; an ONNX file of dynamic size needs it.
     #[arg(long, value_name = "HxW")]
@@ -211,7 +214,13 @@ impl ImportArgs {
         let system = self.system.as_deref().map(str::parse).transpose();
         let system = system.map_err(|e: Error| e.within("--system"))?;
         let resolution = self.resolution.map(|Resolution(h, w)| (h, w));
-        Ok(ImportOptions { system, heads: self.heads, resolution, normalization: self.normalization() })
+        Ok(ImportOptions {
+            system,
+            heads: self.heads,
+            fusion_scales: self.fusion_scales,
+            resolution,
+            normalization: self.normalization(),
+        })
     }
 
     /// `(x·scale − mean)/std` in grey levels.

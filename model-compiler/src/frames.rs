@@ -2,7 +2,7 @@
 //!
 //! Three sources give the same [`Frame`]:
 //! * a **frame directory** `FRAMES/<name>/{rgb.png, lidar.bin, frame.json}`: sensor data, prepared here ([`camera`],
-//!   [`bev`]) by the rules that the networks were trained with
+//!   [`bev`], [`correspondence`]) by the rules that the networks were trained with
 //! * an **image directory**, for classifiers: PNG or JPEG files and, optionally, their labels ([`images`])
 //! * a **tensor file** (`.safetensors`) of ready network inputs, first dimension = frames
 //!
@@ -17,6 +17,7 @@ use std::path::Path;
 
 pub mod bev;
 pub mod camera;
+pub mod correspondence;
 mod directory;
 pub mod images;
 pub mod labels;
@@ -41,6 +42,8 @@ pub struct FrameFormat {
     pub velocity: bool,
     /// Goal point.
     pub goal: bool,
+    /// Cells that see the same points, of the LiDAR map and of the image map: `H×W×2K`.
+    pub points: Option<Shape>,
     /// Height that separates the two histogram channels: meters, relative to a sensor 2.5 m above ground.
     pub split_height_m: f64,
 }
@@ -56,6 +59,7 @@ impl FrameFormat {
             bev: None,
             velocity: false,
             goal: false,
+            points: None,
             split_height_m: split_height_m(system),
         };
         for (kind, shape) in inputs {
@@ -64,6 +68,7 @@ impl FrameFormat {
                 InputKind::Bev => format.bev = Some(shape),
                 InputKind::Velocity => format.velocity = true,
                 InputKind::Goal => format.goal = true,
+                InputKind::BevPoints | InputKind::CameraPoints => format.points = Some(shape),
             }
         }
         format
@@ -72,8 +77,9 @@ impl FrameFormat {
     /// The same, of a classifier if there is nothing but one image to read and the first output is a vector.
     #[must_use]
     pub fn with_output(mut self, image_name: &str, output: Option<Shape>) -> Self {
-        let reads_only_an_image = self.image.is_some() && self.bev.is_none() && !self.velocity && !self.goal;
-        self.classes = output.filter(|s| reads_only_an_image && (s.height, s.width) == (1, 1)).map(|s| s.channels);
+        let others = self.bev.is_some() || self.velocity || self.goal || self.points.is_some();
+        let is_only_input = self.image.is_some() && !others;
+        self.classes = output.filter(|s| is_only_input && (s.height, s.width) == (1, 1)).map(|s| s.channels);
         if self.classes.is_some() {
             self.image_name = image_name.into();
         }
@@ -128,6 +134,10 @@ pub struct Frame {
     pub goal: Option<[f64; 2]>,
     /// Navigation command 1..=6; no network input here.
     pub command: Option<u8>,
+    /// Cells of the camera image for each cell of the LiDAR map ([`correspondence`]).
+    pub bev_points: Option<ByteMap>,
+    /// Cells of the LiDAR map for each cell of the camera image.
+    pub camera_points: Option<ByteMap>,
     /// LiDAR points with a coordinate that is not finite; they are left out.
     pub dropped_points: usize,
     /// What is to be seen, where somebody said so.
@@ -135,7 +145,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The values of one network input in raw units: grey levels, counts, m/s, m.
+    /// The values of one network input in raw units: grey levels, counts, m/s, m, numbers of cells.
     ///
     /// # Errors
     /// The frame does not hold this input.
@@ -146,6 +156,8 @@ impl Frame {
             InputKind::Bev => self.bev.as_ref().map(bytes),
             InputKind::Velocity => self.velocity.map(|v| vec![v as f32]),
             InputKind::Goal => self.goal.map(|g| g.map(|v| v as f32).to_vec()),
+            InputKind::BevPoints => self.bev_points.as_ref().map(bytes),
+            InputKind::CameraPoints => self.camera_points.as_ref().map(bytes),
         };
         values.ok_or_else(|| {
             Error::new(
@@ -165,6 +177,8 @@ impl Frame {
             bev: self.bev.as_ref().map(flip_rows),
             goal: self.goal.map(|[right, y]| [0.0 - right, y]),
             command: self.command.map(mirrored_command),
+            bev_points: self.bev_points.as_ref().map(correspondence::mirrored),
+            camera_points: self.camera_points.as_ref().map(correspondence::mirrored),
             ..self.clone()
         }
     }
@@ -172,7 +186,7 @@ impl Frame {
     /// SHA-256 over everything that a network reads of this frame. The name does not count.
     pub fn digest(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
-        for kind in [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal] {
+        for kind in INPUT_KINDS {
             if let Ok(values) = self.raw(kind) {
                 hash.update(input_name(kind));
                 values.iter().for_each(|v| hash.update(v.to_le_bytes()));
@@ -187,6 +201,16 @@ impl Frame {
     }
 }
 
+/// Every kind of network input.
+pub const INPUT_KINDS: [InputKind; 6] = [
+    InputKind::Image,
+    InputKind::Bev,
+    InputKind::Velocity,
+    InputKind::Goal,
+    InputKind::BevPoints,
+    InputKind::CameraPoints,
+];
+
 /// Name of a network input, as ports carry it.
 pub fn input_name(kind: InputKind) -> &'static str {
     match kind {
@@ -194,6 +218,8 @@ pub fn input_name(kind: InputKind) -> &'static str {
         InputKind::Bev => "bev",
         InputKind::Velocity => "velocity",
         InputKind::Goal => "goal",
+        InputKind::BevPoints => "bev_points",
+        InputKind::CameraPoints => "cam_points",
     }
 }
 

@@ -118,7 +118,7 @@ pub enum System {
     LateFusion,
     /// Image and LiDAR, fused by transformers at up to four scales, waypoints.
     TransFuser,
-    /// Image and LiDAR, fused by projection; recognized, not supported.
+    /// Image and LiDAR, fused by sums over cells that see the same points at up to four scales, waypoints.
     GeometricFusion,
     /// Conditional imitation learning; recognized, not supported.
     Cilrs,
@@ -168,6 +168,8 @@ pub struct ImportOptions {
     pub system: Option<System>,
     /// Checkpoints: attention heads of the transformers; 4 when absent.
     pub heads: Option<u16>,
+    /// Geometric Fusion: how many of the last stages are fused, 1..=4; all when absent. No tensor tells.
+    pub fusion_scales: Option<u8>,
     /// Height and width of camera image and LiDAR histogram, pixels. When absent: 32 pixels per token where a square
     /// positional embedding tells the token grid, else 256×256; for ONNX what the file says.
     pub resolution: Option<(u16, u16)>,
@@ -198,7 +200,7 @@ pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
 
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
 ///
-/// Inputs are `rgb`, `bev`, `velocity` and `goal`, as far as the system has them, in raw units; the output is
+/// Inputs are `rgb`, `bev`, `velocity`, `bev_points`, `cam_points` and `goal`, as far as the system has them, in raw units; the output is
 /// `waypoints`. Values carry the names of the checkpoint's modules.
 ///
 /// # Errors
@@ -217,8 +219,9 @@ fn unrecognized(tensors: &NamedTensors) -> Error {
     } else {
         format!("the tensor names are of no known system ({} tensors: {}, …)", tensors.len(), first.join(", "))
     };
-    Error::new(ErrorCode::Unsupported, "", message)
-        .with_help("supported are checkpoints of aim, late_fusion and transfuser (2021); --system names one")
+    Error::new(ErrorCode::Unsupported, "", message).with_help(
+        "supported are checkpoints of aim, late_fusion, transfuser and geometric_fusion (2021); --system names one",
+    )
 }
 
 #[cfg(test)]
@@ -254,7 +257,7 @@ mod tests {
 
     #[test]
     fn systems_that_come_later_are_refused_by_name() {
-        for system in [System::GeometricFusion, System::Cilrs, System::Lbc] {
+        for system in [System::Cilrs, System::Lbc] {
             let options = ImportOptions { system: Some(system), ..Default::default() };
             let error = import("file.pth", names(&["x"]), &options).unwrap_err();
             assert_eq!(error.code, ErrorCode::Unsupported);
@@ -269,7 +272,8 @@ mod tests {
         assert_eq!(
             error.to_string(),
             "m.pth: the tensor names are of no known system (2 tensors: fc.bias, fc.weight, …)\n  \
-             help: supported are checkpoints of aim, late_fusion and transfuser (2021); --system names one"
+             help: supported are checkpoints of aim, late_fusion, transfuser and geometric_fusion (2021); --system \
+             names one"
         );
     }
 

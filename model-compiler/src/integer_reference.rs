@@ -16,6 +16,7 @@ mod arithmetic;
 mod attention;
 mod concat;
 mod copy_box;
+mod gather_sum;
 mod inputs;
 mod layer_norm;
 mod operands;
@@ -166,6 +167,11 @@ fn dispatch(operands: &Operands, op: &QOp) -> Result<Vec<f64>> {
         }
         QOp::Softmax { input, output, exponent, exp_table } => {
             softmax::softmax(operands, *input, *output, &softmax::Exponential::new(*exponent, exp_table)?)
+        }
+        QOp::GatherSum { input, indices, output, input_zero_point, requant, zero_point, clamp } => {
+            let term = QTerm { tensor: *input, zero_point: *input_zero_point, multiplier: requant.multiplier };
+            let requantizer = Requantizer::new(requant.shift, *zero_point, *clamp);
+            gather_sum::gather_sum(operands, term, *indices, *output, &requantizer)
         }
     }
 }

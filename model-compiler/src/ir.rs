@@ -52,6 +52,10 @@ pub enum InputKind {
     Velocity,
     /// Goal point `[right, forward-negative]`, m.
     Goal,
+    /// For each cell of the LiDAR map, cells of the image map: `H×W×2K`, a row and a column each, from 0.
+    BevPoints,
+    /// For each cell of the image map, cells of the LiDAR map: `H×W×2K`, a row and a column each, from 0.
+    CameraPoints,
 }
 
 /// Bounds of a result: `min(max(x, min), max)`. ReLU is `0..∞`, ReLU6 `0..6`.
@@ -248,6 +252,9 @@ pub enum Op {
     Concat(Axis),
     /// `[x]`: `exp(x) / Σ exp(x)` over the channels of each position.
     Softmax,
+    /// `[map, indices]`: `out[i,j] = Σ_k map[p_ijk]`, where the cell p is the row `indices[i,j,2k]` and the column
+    /// `indices[i,j,2k+1]`; one outside the map means the nearest row or column.
+    GatherSum,
 }
 
 /// One operator application.
@@ -355,6 +362,7 @@ impl Op {
             Self::Pad(_) => "pad",
             Self::Concat(_) => "concat",
             Self::Softmax => "softmax",
+            Self::GatherSum => "gather_sum",
         }
     }
 

@@ -12,9 +12,9 @@ use crate::qmodel::{
 use firmware::image::TensorRecord;
 use firmware::kernels::{k4n16, plan};
 use firmware::program::{
-    Add, Attention, AveragePool, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GlobalPool, KernelId, LayerNorm,
-    Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, Step, Term, TokenSource, Tokens,
-    WaypointDecoder,
+    Add, Attention, AveragePool, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GatherSum, GlobalPool, KernelId,
+    LayerNorm, Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, Step, Term, TokenSource,
+    Tokens, WaypointDecoder,
 };
 use firmware::tensor::TensorId;
 
@@ -295,6 +295,17 @@ impl Packer {
                 exponent: *exponent,
                 exp_table: self.constants.push(exp_table)?,
             }),
+            QOp::GatherSum { input, indices, output, input_zero_point, requant, zero_point, clamp } => {
+                Step::GatherSum(GatherSum {
+                    input: tensor_id(*input)?,
+                    indices: tensor_id(*indices)?,
+                    output: tensor_id(*output)?,
+                    input_zero_point: *input_zero_point,
+                    requant: *requant,
+                    zero_point: *zero_point,
+                    clamp: *clamp,
+                })
+            }
         })
     }
 

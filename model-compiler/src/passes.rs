@@ -8,6 +8,7 @@ use crate::ir::Graph;
 use crate::ir::verify::verify;
 
 mod clip_before_pool;
+mod commute_pointwise;
 mod dead_code;
 #[cfg(test)]
 mod fixture;
@@ -50,13 +51,14 @@ pub fn optimize(graph: &mut Graph) -> Result<()> {
 /// `Numeric`: what the verifier found, such as a folded weight that exceeds the range of `f32`.
 pub fn optimize_with(graph: &mut Graph, options: PassOptions) -> Result<()> {
     type Pass<'a> = &'a dyn Fn(&mut Graph);
-    let passes: [(&str, Pass<'_>); 11] = [
+    let passes: [(&str, Pass<'_>); 12] = [
         ("fold_padding", &fold_padding::run),
         ("fold_batch_norm", &fold_batch_norm::run),
         ("fold_batch_norm_forward", &fold_batch_norm_forward::run),
         ("lower_batch_norm", &lower_batch_norm::run),
         ("fold_normalization", &fold_normalization::run),
         ("lower_normalization", &lower_normalization::run),
+        ("commute_pointwise", &commute_pointwise::run),
         ("fuse_residual", &|graph| fuse_residual::run(graph, options.fuse_residual)),
         ("clip_before_pool", &clip_before_pool::run),
         ("fuse_activation", &fuse_activation::run),

@@ -306,6 +306,15 @@ pub enum QOp {
         /// 257 entries.
         exp_table: Vec<i16>,
     },
+    GatherSum {
+        input: QTensorId,
+        indices: QTensorId,
+        output: QTensorId,
+        input_zero_point: i16,
+        requant: Requant,
+        zero_point: i16,
+        clamp: Clamp,
+    },
 }
 
 impl QModel {
@@ -334,6 +343,7 @@ impl QOp {
             Self::CopyBox { .. } => "copy_box",
             Self::Concat { .. } => "concat",
             Self::Softmax { .. } => "softmax",
+            Self::GatherSum { .. } => "gather_sum",
         }
     }
 
@@ -354,7 +364,8 @@ impl QOp {
             | Self::Tokens { clamp, .. }
             | Self::LayerNorm { clamp, .. }
             | Self::Attention { clamp, .. }
-            | Self::Concat { clamp, .. } => Some(clamp),
+            | Self::Concat { clamp, .. }
+            | Self::GatherSum { clamp, .. } => Some(clamp),
             Self::MaxPool { .. } | Self::CopyBox { .. } | Self::Softmax { .. } | Self::WaypointDecoder(_) => None,
         }
     }
@@ -393,6 +404,7 @@ impl QOp {
             }
             Self::Add { first, second, .. } => vec![first.tensor, second.tensor],
             Self::Concat { first, second, .. } => vec![first.tensor, second.tensor],
+            Self::GatherSum { input, indices, .. } => vec![*input, *indices],
             Self::ResizeBilinear { input, residual, .. } => {
                 std::iter::once(input.tensor).chain(residual.map(|t| t.tensor)).collect()
             }
@@ -418,7 +430,8 @@ impl QOp {
             | Self::Attention { output, .. }
             | Self::CopyBox { output, .. }
             | Self::Concat { output, .. }
-            | Self::Softmax { output, .. } => *output,
+            | Self::Softmax { output, .. }
+            | Self::GatherSum { output, .. } => *output,
             Self::WaypointDecoder(d) => d.output,
         }
     }

@@ -20,6 +20,7 @@ mod copies;
 mod covariance;
 mod decoder;
 pub mod factors;
+mod gather_sum;
 mod moves;
 pub mod ranges;
 mod rounding;
@@ -235,6 +236,7 @@ impl Builder<'_> {
             Op::Concat(axis) => self.concat(node, *axis),
             Op::Clip(clip) => self.clip(node, *clip),
             Op::Softmax => self.softmax(node),
+            Op::GatherSum => self.gather_sum(node),
             Op::Normalize(_) | Op::BatchNorm(_) => Err(Error::new(
                 ErrorCode::Unsupported,
                 "",

@@ -11,6 +11,7 @@ use crate::ir::{Graph, InputKind, Node, Op, Shape, ValueId};
 mod attention;
 mod conv2d;
 mod elementwise;
+mod gather_sum;
 mod layer_norm;
 mod linear;
 mod matmul;
@@ -21,6 +22,7 @@ mod slice;
 mod tokens;
 mod waypoint_decoder;
 
+pub use attention::attention_weights;
 pub use rerun::{Change, rerun};
 
 #[cfg(test)]
@@ -123,6 +125,7 @@ pub fn evaluate(op: &Op, input_shapes: &[Shape], inputs: &[&[f32]], output_shape
         Op::Pad(pad) => slice::pad(pad, input_shapes[0], inputs[0], output_shape),
         Op::Concat(axis) => slice::concat(*axis, input_shapes, inputs),
         Op::Softmax => elementwise::softmax(inputs[0], usize::from(output_shape.channels)),
+        Op::GatherSum => gather_sum::gather_sum(input_shapes[0], inputs, output_shape),
     }
 }
 

@@ -436,6 +436,24 @@ fn operator_changes() -> Vec<(Check, Change)> {
         (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.before[0] = u16::MAX))),
         (Check::StepBorder, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.border = -129))),
         (Check::StepChannels, Parts(|p| *p = softmax_alone(32769))),
+        (
+            Check::StepElement,
+            Parts(|p| {
+                to_fresh_memory(p, &[ids::CELLS]);
+                record(p, ids::CELLS).element = ElementType::I16;
+                record(p, ids::CELLS).bytes *= 2;
+            }),
+        ),
+        (Check::StepShape, Parts(|p| record(p, ids::CELLS).shape = Shape::map(3, 2, 6))),
+        (Check::StepShape, Parts(|p| record(p, ids::CELLS).shape = Shape::map(2, 2, 9))),
+        (Check::StepShape, Parts(|p| record(p, ids::CELLS).shape = Shape::map(4, 3, 3))),
+        (Check::StepShape, Parts(odd_indices)),
+        (Check::StepShape, Parts(|p| record(p, ids::GATHERED).shape = Shape::map(2, 6, 4))),
+        (Check::StepZeroPoint, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.input_zero_point = 128))),
+        (Check::StepZeroPoint, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.zero_point = 1))),
+        (Check::StepClamp, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.clamp = Clamp { min: 1, max: 0 }))),
+        (Check::StepMultiplier, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.requant.multiplier = 1 << 24))),
+        (Check::StepShift, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.requant.shift = 0))),
         (Check::Work, Parts(|p| *p = endless_convolution())),
     ]
 }
@@ -452,6 +470,13 @@ fn wide_hidden_state(parts: &mut ImageParts) {
         s.rescale.multipliers.bytes = 4100;
         s.rescale.shifts.bytes = 1025;
     });
+}
+
+/// A list of cells that ends with half a pair.
+fn odd_indices(parts: &mut ImageParts) {
+    to_fresh_memory(parts, &[ids::CELLS]);
+    record(parts, ids::CELLS).shape = Shape::map(2, 3, 5);
+    record(parts, ids::CELLS).bytes = 30;
 }
 
 /// One softmax over an input.

@@ -35,6 +35,10 @@ pub fn frames((height, width): (u16, u16)) -> Vec<Frame> {
         shape: Shape::map(height, width, channels),
         data: values.iter().map(|&v| v as u8).collect(),
     };
+    let cells = |values: &[f32]| ByteMap {
+        shape: Shape::map(height / 32, width / 32, 10),
+        data: values.iter().map(|&v| v as u8).collect(),
+    };
     golden::frames()
         .iter()
         .enumerate()
@@ -47,8 +51,9 @@ pub fn frames((height, width): (u16, u16)) -> Vec<Frame> {
                 velocity: Some(frame.velocity.into()),
                 goal: Some(frame.target.map(f64::from)),
                 command: Some(frame.command as u8),
-                dropped_points: 0,
-                label: None,
+                bev_points: Some(cells(&frame.bev_points)),
+                camera_points: Some(cells(&frame.camera_points)),
+                ..Frame::default()
             }
         })
         .collect()

@@ -172,13 +172,23 @@ pub fn inputs_file(frames: &[Frame]) -> Vec<u8> {
     let floats = |values: fn(&Frame) -> Vec<f64>| -> Vec<u8> {
         frames.iter().flat_map(values).flat_map(|v| (v as f32).to_le_bytes()).collect()
     };
+    let cells = |map: fn(&Frame) -> &Option<ByteMap>| -> Option<(Vec<usize>, Vec<u8>)> {
+        let shape = map(&frames[0]).as_ref()?.shape;
+        let shape = [frames.len(), shape.height.into(), shape.width.into(), usize::from(shape.channels) / 2, 2];
+        let numbers = frames.iter().flat_map(|frame| &map(frame).as_ref().expect("lists of cells").data);
+        Some((shape.to_vec(), numbers.flat_map(|&cell| i32::from(cell).to_le_bytes()).collect()))
+    };
     let (rgb, bev) = (maps(|f| &f.rgb), maps(|f| &f.bev));
-    let tensors = [
+    let mut tensors = vec![
         ("rgb", Dtype::U8, rgb.0, rgb.1),
         ("bev", Dtype::U8, bev.0, bev.1),
         ("velocity", Dtype::F32, vec![frames.len()], floats(|f| vec![f.velocity.expect("a speed")])),
         ("target", Dtype::F32, vec![frames.len(), 2], floats(|f| f.goal.expect("a goal").to_vec())),
     ];
+    let lists = [("bev_points", cells(|f| &f.bev_points)), ("cam_points", cells(|f| &f.camera_points))];
+    tensors.extend(
+        lists.into_iter().filter_map(|(name, lists)| lists.map(|(shape, data)| (name, Dtype::I32, shape, data))),
+    );
     let views = tensors.iter().map(|(name, element, shape, data)| {
         (*name, TensorView::new(*element, shape.clone(), data).expect("shape and data agree"))
     });

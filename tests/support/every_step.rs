@@ -25,8 +25,11 @@ const CHANNELS: usize = 4;
 /// Height and width of both inputs.
 const SIZE: u16 = 16;
 
+/// Three cells for each of four.
+const LISTS: Shape = Shape::map(2, 2, 6);
+
 /// Names of all operators, as [`firmware::program::Step::name`] gives them.
-pub const OPERATORS: [&str; 15] = [
+pub const OPERATORS: [&str; 16] = [
     "conv2d",
     "linear",
     "max_pool",
@@ -42,6 +45,7 @@ pub const OPERATORS: [&str; 15] = [
     "copy_box",
     "concat",
     "softmax",
+    "gather_sum",
 ];
 
 /// The float network.
@@ -53,6 +57,8 @@ pub fn graph() -> Graph {
     let rgb = b.graph.push_input("rgb", InputKind::Image, Shape::map(SIZE, SIZE, 3));
     let bev = b.graph.push_input("bev", InputKind::Bev, Shape::map(SIZE, SIZE, 2));
     let velocity = b.graph.push_input("velocity", InputKind::Velocity, Shape::vector(1));
+    let bev_points = b.graph.push_input("bev_points", InputKind::BevPoints, LISTS);
+    let camera_points = b.graph.push_input("cam_points", InputKind::CameraPoints, LISTS);
     let goal = b.graph.push_input("goal", InputKind::Goal, Shape::vector(2));
     let image = b.image_branch(rgb);
     let stem = b.conv("lidar.stem", &[bev], Window::square(3, 2, 1), 1, None, Clip::RELU);
@@ -62,6 +68,10 @@ pub fn graph() -> Graph {
     let image = b.push("image.fused", enlarged.clone(), &[image_tokens, image]);
     let lidar_tokens = b.push("lidar.enlarged", enlarged, &[lidar_tokens]);
     let lidar = b.push("lidar.fused", Op::Add { clip: Clip::RELU }, &[lidar, lidar_tokens]);
+    let image_sums = b.push("image.gathered", Op::GatherSum, &[lidar, camera_points]);
+    let lidar_sums = b.push("lidar.gathered", Op::GatherSum, &[image, bev_points]);
+    let sums = b.push("gathered", Op::Add { clip: Clip::NONE }, &[image_sums, lidar_sums]);
+    let image = b.push("image.projected", Op::ResizeBilinear { factor: (2, 2) }, &[sums, image]);
     let features = b.push("features", Op::GlobalPool, &[image, lidar]);
     let joined = b.linear("join.0", &[features], 6, Clip::RELU);
     let hidden = b.linear("join.2", &[joined], CHANNELS, Clip::NONE);
@@ -75,20 +85,19 @@ pub fn graph() -> Graph {
 /// A few random frames of the network's size.
 pub fn frames(seed: u64, count: usize) -> Vec<Frame> {
     let mut random = Random::new(seed);
-    let mut map = |channels: u16, values: usize| {
-        let shape = Shape::map(SIZE, SIZE, channels);
+    let mut map = |shape: Shape, values: usize| {
         let data = (0..shape.elements()).map(|_| random.below(values) as u8).collect();
         Some(ByteMap { shape, data })
     };
     let frame = |i: usize| Frame {
         name: format!("random {i} of seed {seed}"),
-        rgb: map(3, 256),
-        bev: map(2, 6),
+        rgb: map(Shape::map(SIZE, SIZE, 3), 256),
+        bev: map(Shape::map(SIZE, SIZE, 2), 6),
         velocity: Some(1.5 * i as f64),
         goal: Some([2.0 - i as f64, -8.0 - 3.0 * i as f64]),
-        command: None,
-        dropped_points: 0,
-        label: None,
+        bev_points: map(LISTS, 4),
+        camera_points: map(LISTS, 4),
+        ..Frame::default()
     };
     (0..count).map(frame).collect()
 }
@@ -302,6 +311,8 @@ mod tests {
         assert!(forms(&|s| matches!(s, Step::Concat(s) if s.first.requant != exact)), "rescaled");
         assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I16)));
         assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I8)));
+        assert!(forms(&|s| matches!(s, Step::GatherSum(s) if element(s.input) == ElementType::I8)));
+        assert!(forms(&|s| matches!(s, Step::GatherSum(s) if element(s.input) == ElementType::I16)));
         let in_place = parts.tensors.iter().filter(|tensor| tensor.in_place_of.is_some()).count();
         assert!(in_place >= 3, "{in_place} tensors in place");
     }

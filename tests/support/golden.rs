@@ -19,6 +19,10 @@ const SALT: u64 = 1;
 /// Side of the stored frames, pixels.
 const FRAME_SIZE: usize = 256;
 
+/// Pixels per cell, and numbers in the list of a cell.
+const CELL: usize = 32;
+const LIST: usize = 10;
+
 /// A file of `tests/golden`.
 pub fn path(file: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/golden").join(file)
@@ -136,10 +140,15 @@ pub struct Frame {
     pub target: [f32; 2],
     /// Navigation command 1..=6.
     pub command: i32,
+    /// Image cells of each LiDAR cell: `H×W×5` pairs.
+    pub bev_points: Vec<f32>,
+    /// LiDAR cells of each image cell: `H×W×5` pairs.
+    pub camera_points: Vec<f32>,
 }
 
 impl Frame {
-    /// The frame's first rows and columns of the lower center, for a network of smaller input size.
+    /// The frame's first rows and columns of the lower center, for a network of smaller input size; of the lists of cells
+    /// the first, with numbers that the smaller map has.
     ///
     /// # Panics
     /// The size exceeds the stored one.
@@ -152,7 +161,19 @@ impl Frame {
             };
             (0..height).flat_map(row).collect()
         };
-        Self { rgb: crop(&self.rgb, 3), bev: crop(&self.bev, 2), ..self.clone() }
+        let cells = [height / CELL, width / CELL];
+        let lists = |lists: &[f32]| {
+            let row = |y: usize| &lists[y * FRAME_SIZE / CELL * LIST..][..cells[1] * LIST];
+            let rows = (0..cells[0]).flat_map(row);
+            rows.enumerate().map(|(i, &cell)| cell % cells[i % 2] as f32).collect()
+        };
+        Self {
+            rgb: crop(&self.rgb, 3),
+            bev: crop(&self.bev, 2),
+            bev_points: lists(&self.bev_points),
+            camera_points: lists(&self.camera_points),
+            ..self.clone()
+        }
     }
 }
 
@@ -162,12 +183,20 @@ pub fn frames() -> Vec<Frame> {
     let (rgb, bev) = (file.bytes("rgb"), file.bytes("bev"));
     let (velocity, target) = (file.float("velocity"), file.float("target"));
     let command = file.bytes("command");
+    let (bev_points, camera_points) = (file.bytes("bev_points"), file.bytes("cam_points"));
+    let lists = |all: &[u8], i: usize| {
+        let words = all.as_chunks::<4>().0.iter().map(|bytes| i32::from_le_bytes(*bytes) as f32);
+        let count = (FRAME_SIZE / CELL).pow(2) * LIST;
+        words.skip(i * count).take(count).collect()
+    };
     let frame = |i: usize| Frame {
         rgb: channels_last(&rgb, i, 3),
         bev: channels_last(&bev, i, 2),
         velocity: velocity[i],
         target: [target[2 * i], target[2 * i + 1]],
         command: i32::from_le_bytes(command[4 * i..][..4].try_into().expect("four bytes")),
+        bev_points: lists(&bev_points, i),
+        camera_points: lists(&camera_points, i),
     };
     (0..velocity.len()).map(frame).collect()
 }
@@ -279,9 +308,12 @@ mod tests {
 
     #[test]
     fn checkpoints_equal_those_of_the_python_generator() {
-        for (system, expected) in
-            [(System::Aim, 0x2608_0f08), (System::LateFusion, 0xcd82_6882), (System::TransFuser, 0x9953_4b15)]
-        {
+        for (system, expected) in [
+            (System::Aim, 0x2608_0f08),
+            (System::LateFusion, 0xcd82_6882),
+            (System::TransFuser, 0x9953_4b15),
+            (System::GeometricFusion, 0xd579_3ed8),
+        ] {
             assert_eq!(crc(&checkpoint(system)), expected, "{}", system.name());
         }
     }
@@ -320,15 +352,23 @@ mod tests {
             assert!(frame.rgb.iter().all(|v| (0.0..=255.0).contains(v)) && frame.rgb.iter().any(|&v| v > 100.0));
             assert!(frame.bev.iter().all(|v| (0.0..=5.0).contains(v)) && frame.bev.iter().any(|&v| v > 0.0));
             assert!((1..=6).contains(&frame.command));
+            for lists in [&frame.bev_points, &frame.camera_points] {
+                assert_eq!(lists.len(), 8 * 8 * 10);
+                assert!(lists.iter().all(|v| (0.0..=7.0).contains(v)) && lists.contains(&7.0));
+            }
             let small = frame.cropped(64, 32);
             assert_eq!((small.rgb.len(), small.bev.len()), (64 * 32 * 3, 64 * 32 * 2));
+            assert_eq!(small.bev_points.len(), 2 * 10);
+            assert!(small.bev_points.chunks(2).all(|pair| pair[0] <= 1.0 && pair[1] == 0.0));
             assert_eq!(small.rgb[..3], frame.rgb[(192 * 256 + 112) * 3..][..3]);
         }
     }
 
     #[test]
     fn stored_results_are_complete() {
-        for (system, taps) in [(System::Aim, 5), (System::LateFusion, 9), (System::TransFuser, 13)] {
+        for (system, taps) in
+            [(System::Aim, 5), (System::LateFusion, 9), (System::TransFuser, 13), (System::GeometricFusion, 9)]
+        {
             let expected = expected(system);
             assert_eq!((expected.waypoints.len(), expected.taps.len()), (4, taps));
             assert!(expected.taps.values().all(|t| t.len() == 4 && t[0].len() >= 64));

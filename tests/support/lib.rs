@@ -1,5 +1,6 @@
 //! Support for the integration tests.
 
+pub mod boards;
 pub mod agent;
 pub mod build;
 pub mod bundle;

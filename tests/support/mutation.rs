@@ -33,8 +33,8 @@ const NUMBERS: [i64; 17] = [
 ];
 
 /// Fields of steps that name a tensor.
-const TENSOR_FIELDS: [&str; 11] =
-    ["input", "output", "tensor", "map", "velocity", "query", "key", "value", "hidden", "goal", "scratch"];
+const TENSOR_FIELDS: [&str; 12] =
+    ["input", "indices", "output", "tensor", "map", "velocity", "query", "key", "value", "hidden", "goal", "scratch"];
 
 /// Visits every mutation of an image.
 ///

@@ -27,6 +27,9 @@ pub fn graph(seed: u64) -> Graph {
     for _ in 0..4 + drawing.random.below(9) {
         drawing.grow();
     }
+    if seed.is_multiple_of(4) {
+        drawing.gather();
+    }
     drawing.head();
     drawing.graph
 }
@@ -46,15 +49,15 @@ pub fn frames(graph: &Graph, seed: u64, count: usize) -> Vec<Frame> {
             values[channel] as u8
         };
         let data = (0..shape.elements() as usize).map(|element| pixel(element % 3)).collect();
+        let lists = graph.inputs().find(|(_, kind)| *kind == InputKind::BevPoints);
+        let lists = lists.map(|(id, _)| graph.value(id).shape);
+        let bev_points =
+            lists.map(|shape| ByteMap { shape, data: (0..shape.elements()).map(|_| random.below(12) as u8).collect() });
         Frame {
             name: format!("random {i} of seed {seed}"),
             rgb: Some(ByteMap { shape, data }),
-            bev: None,
-            velocity: None,
-            goal: None,
-            command: None,
-            dropped_points: 0,
-            label: None,
+            bev_points,
+            ..Frame::default()
         }
     };
     (0..count).map(frame).collect()
@@ -267,6 +270,15 @@ impl Drawing {
             operands.insert(at, other);
         }
         self.push(Op::Concat(axis), &operands)
+    }
+
+    /// Sums of cells of a map that an input names; later cells than the map has mean its last ones.
+    fn gather(&mut self) {
+        let map = self.map();
+        let lists = Shape::map(self.between(1, 6), self.between(1, 6), 2 * self.between(1, 5));
+        let lists = self.graph.push_input("bev_points", InputKind::BevPoints, lists);
+        let sums = self.push(Op::GatherSum, &[map, lists]);
+        self.maps.push(sums);
     }
 
     /// Vectors of one or two maps, linear layers, probabilities or not; a convolution over a vector now and then.

@@ -2,7 +2,7 @@
 
 use super::draw::Draw;
 use super::{Case, Outcome, code_bits};
-use crate::kernels::{ConcatSourceArgs, CopyBoxArgs, PoolArgs, RequantArgs, ResizeArgs, TermArgs, plan};
+use crate::kernels::{ConcatSourceArgs, CopyBoxArgs, GatherSumArgs, PoolArgs, RequantArgs, ResizeArgs, TermArgs, plan};
 use crate::program::{Axis, Requant, Window};
 use crate::tensor::{ElementType, Shape, index};
 
@@ -192,6 +192,23 @@ pub(super) fn concat(case: &mut Case<'_>, _: u32) -> Outcome {
     let stored = draw.codes(output, elements)?;
     case.describe(format_args!("{:?} along {axis:?}, to {output:?}", sources.map(|source| source.shape)));
     case.compare(stored, elements, |kernels, output| kernels.concat(axis, &sources, output))
+}
+
+/// Indices inside the map and outside of it.
+pub(super) fn gather_sum(case: &mut Case<'_>, _: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let channels = draw.one_of(&CHANNELS);
+    let input_shape = Shape::map(draw.size(1, 9), draw.size(1, 9), channels);
+    let output_shape = Shape::map(draw.size(1, 9), draw.size(1, 9), channels);
+    let (cells, input, output) = (draw.size(1, 6), draw.element(), draw.element());
+    let (low, high) = if draw.flag() { (0, 8) } else { (-128, 127) };
+    let indices = draw.values(index(output_shape.positions()) * usize::from(cells) * 2, low, high)?;
+    let requant = draw.requant_args(input, code_bits(input) + 2, output);
+    let args = GatherSumArgs { input_shape, output_shape, indices, requant };
+    let (codes, stored) = (draw.map(input, input_shape)?.codes()?, draw.map(output, output_shape)?);
+    case.describe(format_args!("{cells} cells of {input:?} {input_shape:?} to {output:?} {output_shape:?}"));
+    let elements = usize::try_from(output_shape.elements()).ok()?;
+    case.compare(stored, elements, |kernels, output| kernels.gather_sum(&args, codes, output))
 }
 
 /// A factor of exactly one.

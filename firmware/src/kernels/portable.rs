@@ -10,6 +10,7 @@ pub mod concat;
 pub mod conv2d;
 pub mod copy_box;
 pub mod elementwise;
+pub mod gather_sum;
 pub mod layer_norm;
 pub mod linear;
 #[cfg(test)]

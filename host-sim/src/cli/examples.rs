@@ -10,6 +10,8 @@ Examples:
   host-sim verify transfuser.img --model transfuser.pth --frames drive/ --mirror --min-sqnr 20
   host-sim bench transfuser.img
   host-sim ablate transfuser.pth --calib frames/ --frames drive/
+  host-sim attention transfuser.img --model transfuser.pth --frames drive/
+  host-sim score route-1.json route-2.json
   host-sim completions bash";
 
 pub const RUN: &str = "Examples:
@@ -30,11 +32,23 @@ pub const DIFF: &str = "Examples:
   host-sim diff old/report.json new/report.json --max-loss 1 --report out/";
 
 pub const SCHEMA: &str = "Examples:
-  host-sim schema";
+  host-sim schema
+  host-sim schema attention
+  host-sim schema route-log";
 
 pub const ABLATE: &str = "Examples:
   host-sim ablate transfuser.pth --calib frames/ --frames drive/
   host-sim ablate transfuser.pth --calib inputs.safetensors --inputs inputs.safetensors --mirror --json";
+
+pub const ATTENTION: &str = "Examples:
+  host-sim attention transfuser.img --model transfuser.pth --frames drive/
+  host-sim attention transfuser.img --model transfuser.pth --frames drive/ --report out/
+  host-sim attention transfuser.img --frames drive/ --block encoder.transformer2
+  host-sim attention transfuser.pth --frames drive/ --image-rows 3,4 --lidar-rows 5,6,7 --top 3 --json";
+
+pub const SCORE: &str = "Examples:
+  host-sim score route-1.json route-2.json
+  host-sim score route-1.json --json";
 
 pub const BENCH: &str = "Examples:
   host-sim bench transfuser.img

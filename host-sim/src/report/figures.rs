@@ -80,6 +80,12 @@ pub(crate) fn shape([height, width, channels]: [u16; 3]) -> String {
     format!("{height}×{width}×{channels}")
 }
 
+/// `2, 3, 4`.
+pub(crate) fn listed(numbers: &[u16]) -> String {
+    let numbers: Vec<String> = numbers.iter().map(u16::to_string).collect();
+    numbers.join(", ")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -4,11 +4,13 @@
 //! is escaped by the template. Every plot has its figures in a table below it.
 
 use super::VerifyReport;
+use crate::attention::AttentionReport;
 use crate::diff::Diff;
 use crate::gates::GateOutcome;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use model_compiler::frames::Frame;
 
+mod attention;
 mod changes;
 mod channels;
 mod classes;
@@ -16,6 +18,7 @@ mod frames;
 mod gates;
 mod graph;
 mod histogram;
+mod maps;
 mod memory;
 mod noise;
 mod plot;
@@ -59,6 +62,17 @@ pub fn diff_page(diff: &Diff, gates: &[GateOutcome]) -> String {
         (gates::section(gates))
     };
     shell(&format!("{} → {}", diff.before.name, diff.after.name), &body)
+}
+
+/// The page of attention statistics. `frames` are its frames, in order.
+pub fn attention_page(report: &AttentionReport, frames: &[Frame]) -> String {
+    let body = html! {
+        (attention::summary(report))
+        (attention::statistics(report))
+        (attention::cells(report, frames))
+        (attention::frames(report))
+    };
+    shell(&format!("Attention at {}", report.block), &body)
 }
 
 fn shell(title: &str, body: &Markup) -> String {

@@ -2,9 +2,11 @@
 
 use super::VerifyReport;
 use crate::ablation::Row;
+use crate::attention::AttentionReport;
 use crate::bench::figures::BenchReport;
 use crate::diff::Diff;
 use crate::gates::GateOutcome;
+use crate::metrics::{RouteLog, Score};
 use crate::run::RunReport;
 use model_compiler::error::{Error, ErrorCode, Result};
 use schemars::JsonSchema;
@@ -37,10 +39,29 @@ pub fn diff(diff: &Diff, gates: &[GateOutcome], failure: Option<&Error>) -> Valu
     document
 }
 
-/// JSON Schema of a verification's document.
-pub fn schema() -> Value {
-    let generator = SchemaSettings::default().for_serialize().into_generator();
-    generator.into_root_schema_for::<VerifyReport>().to_value()
+/// Documents that have a JSON Schema.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub enum Document {
+    /// Of a verification.
+    Verify,
+    /// Of attention statistics.
+    Attention,
+    /// Of scored drives.
+    Score,
+    /// The log of a drive, which is read.
+    RouteLog,
+}
+
+/// JSON Schema of a document.
+pub fn schema(document: Document) -> Value {
+    let written = || SchemaSettings::default().for_serialize().into_generator();
+    let schema = match document {
+        Document::Verify => written().into_root_schema_for::<VerifyReport>(),
+        Document::Attention => written().into_root_schema_for::<AttentionReport>(),
+        Document::Score => written().into_root_schema_for::<Score>(),
+        Document::RouteLog => SchemaSettings::default().into_generator().into_root_schema_for::<RouteLog>(),
+    };
+    schema.to_value()
 }
 
 /// A document as the bytes of a file.
@@ -84,6 +105,16 @@ impl VerifyReport {
 /// Document of an ablation.
 pub fn ablation(rows: &[Row]) -> Value {
     json!({"schema": 1, "variants": to_value(&rows)})
+}
+
+/// Document of attention statistics.
+pub fn attention(report: &AttentionReport) -> Value {
+    to_value(report)
+}
+
+/// Document of scored drives.
+pub fn score(score: &Score) -> Value {
+    to_value(score)
 }
 
 /// Document of a measurement.

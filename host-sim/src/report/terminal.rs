@@ -9,9 +9,13 @@ use crate::run::{FrameResult, ModelInfo, Output, RunReport, Waypoints};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
 
+mod attention;
 mod bench;
+mod score;
 
+pub use attention::attention;
 pub use bench::bench;
+pub use score::score;
 
 /// Changed steps that a terminal shows.
 const MAX_CHANGES: usize = 20;

@@ -1,6 +1,6 @@
 //! Frame directories: one folder per frame with camera image, LiDAR points and a small description.
 
-use super::{Frame, FrameFormat, bev, camera};
+use super::{Frame, FrameFormat, bev, camera, correspondence};
 use crate::error::{Error, ErrorCode, Result};
 use bev::LidarAxes;
 use serde_json::Value;
@@ -39,15 +39,21 @@ fn frame_folders(path: &Path) -> Result<Vec<PathBuf>> {
 
 fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
     let description = Description::read(&folder.join(DESCRIPTION))?;
-    let (bev, dropped_points) = match format.bev {
-        Some(shape) if !bev::is_possible(shape) => return Err(wrong_histogram_size(folder, shape)),
-        Some(shape) => {
-            let points = read_points(&folder.join(LIDAR), &description)?;
-            let (map, dropped) = bev::histogram(points, format.split_height_m, shape);
-            (Some(map), dropped)
-        }
+    if let Some(shape) = format.bev.filter(|shape| !bev::is_possible(*shape)) {
+        return Err(wrong_histogram_size(folder, shape));
+    }
+    if let Some(shape) = format.points.filter(|shape| !correspondence::is_possible(*shape)) {
+        return Err(wrong_grid(folder, shape));
+    }
+    let reads_points = format.bev.is_some() || format.points.is_some();
+    let points = reads_points.then(|| read_points(&folder.join(LIDAR), &description)).transpose()?;
+    let points = || points.iter().flatten().copied();
+    let (bev, dropped_points) = match format.bev.map(|shape| bev::histogram(points(), format.split_height_m, shape)) {
+        Some((map, dropped)) => (Some(map), dropped),
         None => (None, 0),
     };
+    let correspondence = format.points.map(|shape| correspondence::correspondence(points(), shape));
+    let (bev_points, camera_points) = correspondence.map(|lists| (lists.bev, lists.camera)).unzip();
     Ok(Frame {
         name: folder.file_name().unwrap_or_default().to_string_lossy().into_owned(),
         rgb: format.image.map(|shape| camera::load(&folder.join(IMAGE), shape)).transpose()?,
@@ -55,6 +61,8 @@ fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
         velocity: format.velocity.then(|| description.number("speed")).transpose()?,
         goal: format.goal.then(|| description.goal()).transpose()?,
         command: description.command()?,
+        bev_points,
+        camera_points,
         dropped_points,
         label: None,
     })
@@ -63,6 +71,14 @@ fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
 fn wrong_histogram_size(folder: &Path, shape: firmware::tensor::Shape) -> Error {
     let message = format!(
         "the network reads a {}×{}×{} histogram, frame folders give powers of two up to 1024 and 2 channels",
+        shape.height, shape.width, shape.channels
+    );
+    Error::new(ErrorCode::Frames, folder.display().to_string(), message).with_help("feed it with a .safetensors file")
+}
+
+fn wrong_grid(folder: &Path, shape: firmware::tensor::Shape) -> Error {
+    let message = format!(
+        "the network gathers {}×{} cells by {} numbers each, frame folders give pairs for 1×1 to 9×9 cells",
         shape.height, shape.width, shape.channels
     );
     Error::new(ErrorCode::Frames, folder.display().to_string(), message).with_help("feed it with a .safetensors file")
@@ -209,6 +225,32 @@ mod tests {
         // Forward 1 m, left 10 m, 0.7 m above ground: the upper channel.
         let (row, column) = ((42.0 / (65.0 / 256.0)) as usize, (31.0 / 0.125) as usize);
         assert_eq!(bev[(row * 256 + column) * 2 + 1], 1);
+    }
+
+    #[test]
+    fn cells_that_see_the_same_points_come_from_the_same_sweep() {
+        let points = |side: u16| {
+            let cells = (InputKind::BevPoints, Shape::map(side, side, 10));
+            let inputs = [cells, (InputKind::CameraPoints, cells.1), (InputKind::Goal, Shape::vector(2))];
+            load(directory(GOOD).path(), &FrameFormat::new("geometric_fusion", inputs))
+        };
+        let frame = points(8).unwrap().remove(0);
+        let cells = |map: &Option<super::super::ByteMap>| {
+            map.as_ref()
+                .unwrap()
+                .data
+                .iter()
+                .enumerate()
+                .filter(|(_, v)| **v != 0)
+                .map(|(i, &v)| (i, v))
+                .collect::<Vec<_>>()
+        };
+        // The point lies in LiDAR cell (4, 2) and image cell (4, 5).
+        assert_eq!(cells(&frame.bev_points), [(340, 4), (341, 5)]);
+        assert_eq!(cells(&frame.camera_points), [(370, 4), (371, 2)]);
+        assert!(frame.bev.is_none());
+        let message = points(16).unwrap_err().to_string();
+        assert!(message.contains("gathers 16×16 cells by 10 numbers each"), "{message}");
     }
 
     #[test]

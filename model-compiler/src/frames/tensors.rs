@@ -1,5 +1,6 @@
 //! Ready network inputs in a `.safetensors` file: `rgb` u8 `[N,3,H,W]`, `bev` u8 `[N,2,H,W]` (counts 0..=5), `velocity`
-//! f32 `[N]`, `target` f32 `[N,2]` (network frame), and optionally `command` i32 `[N]`.
+//! f32 `[N]`, `target` f32 `[N,2]` (network frame), `bev_points` and `cam_points` i32 `[N,H,W,K,2]` (cells that see the
+//! same points), and optionally `command` i32 `[N]`.
 //!
 //! Of a classifier: the image by the network's own name for it, or as `rgb`, `[N,C,H,W]`, and optionally `label` i64
 //! `[N]`. Images may be f32 as well; they are raw, so every value is a whole number 0..=255.
@@ -31,6 +32,8 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
     }
     let velocity = format.velocity.then(|| batch.floats("velocity", &[])).transpose()?;
     let goal = format.goal.then(|| batch.floats("target", &[2])).transpose()?;
+    let points = |batch: &mut Batch<'_>, name| format.points.map(|shape| batch.cells(name, shape)).transpose();
+    let (bev_points, camera_points) = (points(&mut batch, "bev_points")?, points(&mut batch, "cam_points")?);
     let count = batch.frames.unwrap_or(0);
     let command = batch.commands(count)?;
     let labels = format.classes.map(|classes| batch.labels(classes)).transpose()?.flatten();
@@ -44,6 +47,8 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
         velocity: velocity.as_ref().map(|v| f64::from(v[i])),
         goal: goal.as_ref().map(|g| [f64::from(g[2 * i]), f64::from(g[2 * i + 1])]),
         command: command.as_ref().map(|c| c[i]),
+        bev_points: bev_points.as_ref().map(|maps| maps[i].clone()),
+        camera_points: camera_points.as_ref().map(|maps| maps[i].clone()),
         dropped_points: 0,
         label: labels.as_ref().map(|labels| labels[i].clone()),
     };
@@ -114,6 +119,22 @@ impl<'a> Batch<'a> {
             ByteMap { shape, data }
         };
         Ok(planes.chunks_exact(channels * plane).map(channel_fastest).collect())
+    }
+
+    /// `[N][H][W][K][2]` cells of a map as large, to a map of pairs per frame.
+    fn cells(&mut self, name: &str, shape: Shape) -> Result<Vec<ByteMap>> {
+        let [height, width, pairs] = [shape.height, shape.width, shape.channels / 2].map(usize::from);
+        let view = self.tensor(name, Dtype::I32, &[height, width, pairs, 2])?;
+        let number = |(i, &bytes): (usize, &[u8; 4])| {
+            let (value, size) = (i32::from_le_bytes(bytes), if i % 2 == 0 { height } else { width });
+            u8::try_from(value)
+                .ok()
+                .filter(|&cell| usize::from(cell) < size)
+                .ok_or_else(|| tensor_error(name, format!("holds {value}, expected cells 0..={}", size - 1)))
+        };
+        let cells: Vec<u8> = view.data().as_chunks::<4>().0.iter().enumerate().map(number).collect::<Result<_>>()?;
+        let maps = cells.chunks_exact(height * width * pairs * 2);
+        Ok(maps.map(|data| ByteMap { shape, data: data.to_vec() }).collect())
     }
 
     fn labels(&mut self, classes: u16) -> Result<Option<Vec<Label>>> {
@@ -259,6 +280,32 @@ mod tests {
             let message = load_as(&format, &tensors).unwrap_err().to_string();
             assert!(message.contains(expected), "{message}");
         }
+    }
+
+    #[test]
+    fn cells_are_pairs_of_row_and_column_inside_the_map() {
+        let shape = Shape::map(1, 2, 4);
+        let inputs = [(InputKind::BevPoints, shape), (InputKind::CameraPoints, shape)];
+        let format = FrameFormat::new("geometric_fusion", inputs);
+        let cells = |name, values: [i32; 16]| {
+            Tensor(name, Dtype::I32, vec![2, 1, 2, 2, 2], values.map(i32::to_le_bytes).concat())
+        };
+        let good = [0, 1, 0, 0, 0, 1, 0, 1, 0, 0, 0, 0, 0, 1, 0, 0];
+        let frames = load_as(&format, &[cells("bev_points", good), cells("cam_points", [0; 16])]).unwrap();
+        assert_eq!(frames[0].bev_points.as_ref().unwrap().data, [0, 1, 0, 0, 0, 1, 0, 1]);
+        assert_eq!(frames[1].bev_points.as_ref().unwrap().data, [0, 0, 0, 0, 0, 1, 0, 0]);
+        assert_eq!(frames[1].raw(InputKind::CameraPoints).unwrap(), [0.0; 8]);
+        for (at, value, expected) in
+            [(3, 2, "holds 2, expected cells 0..=1"), (2, -1, "holds -1, expected cells 0..=0")]
+        {
+            let mut bad = good;
+            bad[at] = value;
+            let message =
+                load_as(&format, &[cells("bev_points", bad), cells("cam_points", good)]).unwrap_err().to_string();
+            assert!(message.contains(&format!("tensor `bev_points`: {expected}")), "{message}");
+        }
+        let message = load_as(&format, &[cells("bev_points", good)]).unwrap_err().to_string();
+        assert!(message.contains("tensor `cam_points`: missing"), "{message}");
     }
 
     #[test]

@@ -11,6 +11,7 @@ use builder::Builder;
 mod aim;
 mod builder;
 mod detect;
+mod geometric_fusion;
 mod head;
 mod late_fusion;
 mod resnet;
@@ -33,7 +34,7 @@ pub(super) fn detect(tensors: &NamedTensors) -> Option<System> {
     let recognized: [(System, bool); 6] = [
         (System::Lbc, has(tensors, "net.network.backbone.")),
         (System::Cilrs, has(tensors, "encoder.features.") && has(tensors, "controller.")),
-        (System::GeometricFusion, has(tensors, "encoder.image_conv") || has(tensors, "encoder.image_projection")),
+        (System::GeometricFusion, geometric_fusion::recognize(tensors)),
         (System::TransFuser, transfuser::recognize(tensors)),
         (System::LateFusion, late_fusion::recognize(tensors)),
         (System::Aim, aim::recognize(tensors)),
@@ -47,12 +48,18 @@ pub(super) fn build(system: System, name: &str, tensors: NamedTensors, options: 
         System::Aim => aim::build,
         System::LateFusion => late_fusion::build,
         System::TransFuser => transfuser::build,
-        System::GeometricFusion | System::Cilrs | System::Lbc => {
+        System::GeometricFusion => geometric_fusion::build,
+        System::Cilrs | System::Lbc => {
             let message = format!("this is a checkpoint of {}, which is not supported", system.name());
             return Err(Error::new(ErrorCode::Unsupported, "", message)
-                .with_help("supported are aim, late_fusion and transfuser"));
+                .with_help("supported are aim, late_fusion, transfuser and geometric_fusion"));
         }
     };
+    if options.fusion_scales.is_some() && system != System::GeometricFusion {
+        let message = format!("--fusion-scales has no effect on {}", system.name());
+        return Err(Error::new(ErrorCode::Usage, "", message)
+            .with_help("leave it out; the tensors of other systems tell their scales"));
+    }
     let mut builder = Builder::new(name, system, tensors, options);
     let built = recipe(&mut builder);
     builder.finish(built)

@@ -5,9 +5,10 @@ use crate::ir::InputKind;
 
 /// Codes of one input from raw values (numerics, "Inputs").
 ///
-/// Raw units: an image holds 0..=255, a BEV histogram counts 0..=5, the velocity is in m/s and the goal in m. Images
-/// become `u8 − 128` and counts stay as they are (both saturate, and a fraction rounds to the nearest integer, ties up,
-/// though none is expected); velocity becomes i16 Q8, the goal i32 Q16, both by `floor(2^k·x + ½)`, saturated.
+/// Raw units: an image holds 0..=255, a BEV histogram counts 0..=5, cells are numbered from 0, the velocity is in m/s and
+/// the goal in m. Images become `u8 − 128`, counts and cells stay as they are (all saturate, and a fraction rounds to the
+/// nearest integer, ties up, though none is expected); velocity becomes i16 Q8, the goal i32 Q16, both by
+/// `floor(2^k·x + ½)`, saturated.
 pub fn encode_input(kind: InputKind, raw: &[f64]) -> Vec<f64> {
     let round = |x: f64| (x + 0.5).floor();
     let code = |&x: &f64| match kind {
@@ -15,6 +16,7 @@ pub fn encode_input(kind: InputKind, raw: &[f64]) -> Vec<f64> {
         InputKind::Bev => round(x).clamp(0.0, 5.0),
         InputKind::Velocity => saturate_i16(round(256.0 * x)),
         InputKind::Goal => round(65536.0 * x).clamp(-2147483648.0, 2147483647.0),
+        InputKind::BevPoints | InputKind::CameraPoints => round(x).clamp(0.0, 127.0),
     };
     raw.iter().map(code).collect()
 }
@@ -27,6 +29,7 @@ mod tests {
     fn raw_values_become_codes() {
         assert_eq!(encode_input(InputKind::Image, &[0.0, 128.0, 255.0]), [-128.0, 0.0, 127.0]);
         assert_eq!(encode_input(InputKind::Bev, &[0.0, 3.0, 5.0]), [0.0, 3.0, 5.0]);
+        assert_eq!(encode_input(InputKind::BevPoints, &[0.0, 7.0, 200.0, -1.0]), [0.0, 7.0, 127.0, 0.0]);
         let speeds = [0.0, 1.0 / 512.0, -1.0 / 512.0, 5.3, 127.999, 128.0, -200.0];
         let codes = [0.0, 1.0, 0.0, 1357.0, 32767.0, 32767.0, -32768.0];
         assert_eq!(encode_input(InputKind::Velocity, &speeds), codes);

@@ -334,6 +334,14 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
                 narrow(AXES[axis], sum)
             })
         }
+        Op::GatherSum => {
+            arity(op, inputs, 2..=2)?;
+            let indices = inputs[1];
+            if indices.channels % 2 != 0 {
+                return Err(format!("{} channels of indices are no pairs of row and column", indices.channels));
+            }
+            Ok(Shape { channels: inputs[0].channels, ..indices })
+        }
         Op::Concat(axis) => {
             arity(op, inputs, 1..=usize::MAX)?;
             let joined = *axis as usize;

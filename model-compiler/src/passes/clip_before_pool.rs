@@ -1,18 +1,14 @@
 //! A clip (ReLU) behind a max pool goes in front of it, where the layer before the pool can take it: the largest of
 //! bounded values is the bounded largest value.
 
+use super::rewrite::{exchange, own_producer};
 use crate::ir::{Graph, Op};
 
 pub(super) fn run(graph: &mut Graph) {
     for reader in 0..graph.nodes.len() {
-        let Some((producer, layer)) = chain(graph, reader) else { continue };
-        // The pool's value becomes the clip's, in front of it and of the operand's size.
-        let between = graph.nodes[producer].output.0 as usize;
-        graph.values[between].shape = graph.value(graph.nodes[layer].output).shape;
-        graph.values[between].name.push_str(".input");
-        graph.nodes[producer].name.push_str(".input");
-        let clip = graph.nodes[reader].op.clone();
-        graph.nodes[reader].op = std::mem::replace(&mut graph.nodes[producer].op, clip);
+        let Some((pool, layer)) = chain(graph, reader) else { continue };
+        let unpooled = graph.value(graph.nodes[layer].output).shape;
+        exchange(graph, pool, reader, unpooled);
     }
 }
 
@@ -21,14 +17,8 @@ fn chain(graph: &Graph, reader: usize) -> Option<(usize, usize)> {
     if !matches!(graph.nodes[reader].op, Op::Clip(_)) {
         return None;
     }
-    let only_operand = |node: usize| {
-        let value = *graph.nodes[node].inputs.first()?;
-        let reads = graph.nodes.iter().flat_map(|n| &n.inputs).chain(&graph.outputs).filter(|id| **id == value);
-        let producer = graph.nodes.iter().position(|n| n.output == value)?;
-        (reads.count() == 1).then_some(producer)
-    };
-    let pool = only_operand(reader).filter(|pool| matches!(graph.nodes[*pool].op, Op::MaxPool(_)))?;
-    let layer = only_operand(pool)?;
+    let pool = own_producer(graph, reader).filter(|pool| matches!(graph.nodes[*pool].op, Op::MaxPool(_)))?;
+    let layer = own_producer(graph, pool)?;
     let takes_clips = matches!(graph.nodes[layer].op, Op::Conv2d(_) | Op::Linear(_) | Op::Add { .. });
     takes_clips.then_some((pool, layer))
 }

@@ -2,7 +2,7 @@
 //!
 //! | value | type |
 //! |---|---|
-//! | image, BEV | i8 codes with the fixed scales of the numerics page |
+//! | image, BEV, cells to gather | i8 codes with the fixed scales of the numerics page |
 //! | feature maps, LayerNorm outputs, attention context, MLP hidden | i8 affine |
 //! | queries, keys, values | i8 symmetric |
 //! | residual stream of a transformer | i16, one scale for all its taps |
@@ -132,6 +132,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
         types.push(match *role {
             Role::Input(InputKind::Image) => Stored::fixed(ElementType::I8, 1.0, -128),
             Role::Input(InputKind::Bev) => Stored::fixed(ElementType::I8, 0.2, 0),
+            Role::Input(InputKind::BevPoints | InputKind::CameraPoints) => Stored::fixed(ElementType::I8, 1.0, 0),
             Role::Input(InputKind::Velocity) => Stored::fixed(ElementType::I16, f64::exp2(-8.0), 0),
             Role::Input(InputKind::Goal) | Role::Waypoints => Stored::fixed(ElementType::I32, f64::exp2(-16.0), 0),
             Role::Narrow => narrow(),

@@ -7,23 +7,37 @@ use rayon::prelude::*;
 pub(super) fn attention(heads: u16, shape: Shape, inputs: &[&[f32]]) -> Vec<f32> {
     let &[queries, keys, values] = inputs else { unreachable!("three operands, checked by the shape rule") };
     let (tokens, channels) = (shape.positions() as usize, usize::from(shape.channels));
+    let weights = attention_weights(heads, shape, queries, keys);
     let depth = channels / usize::from(heads);
-    let columns = transpose(keys, channels);
     let mut out = vec![0.0; tokens * channels];
-    out.par_chunks_exact_mut(channels).zip(queries.par_chunks_exact(channels)).for_each(|(out, query)| {
-        for (head, context) in out.chunks_exact_mut(depth).enumerate() {
-            let first = head * depth;
-            let mut weights = vec![0.0; tokens];
-            for c in first..first + depth {
-                add_scaled(&mut weights, query[c], &columns[c * tokens..][..tokens]);
-            }
-            softmax(&mut weights, 1.0 / (depth as f64).sqrt());
-            for (&weight, value) in weights.iter().zip(values.chunks_exact(channels)) {
-                add_scaled(context, weight, &value[first..first + depth]);
+    let rows = weights.par_chunks_exact(tokens * usize::from(heads));
+    out.par_chunks_exact_mut(channels).zip(rows).for_each(|(out, rows)| {
+        for (head, (context, row)) in out.chunks_exact_mut(depth).zip(rows.chunks_exact(tokens)).enumerate() {
+            for (&weight, value) in row.iter().zip(values.chunks_exact(channels)) {
+                add_scaled(context, weight, &value[head * depth..][..depth]);
             }
         }
     });
     out
+}
+
+/// softmax(q·kᵀ/√(C/heads)) of [`Op::Attention`](crate::ir::Op::Attention) with queries and keys `T×C`: by query, then
+/// head, a row of T weights that add up to 1.
+pub fn attention_weights(heads: u16, shape: Shape, queries: &[f32], keys: &[f32]) -> Vec<f32> {
+    let (tokens, channels) = (shape.positions() as usize, usize::from(shape.channels));
+    let depth = channels / usize::from(heads);
+    let columns = transpose(keys, channels);
+    let mut weights = vec![0.0; tokens * usize::from(heads) * tokens];
+    let rows = weights.par_chunks_exact_mut(tokens * usize::from(heads));
+    rows.zip(queries.par_chunks_exact(channels)).for_each(|(rows, query)| {
+        for (head, row) in rows.chunks_exact_mut(tokens).enumerate() {
+            for c in head * depth..(head + 1) * depth {
+                add_scaled(row, query[c], &columns[c * tokens..][..tokens]);
+            }
+            softmax(row, 1.0 / (depth as f64).sqrt());
+        }
+    });
+    weights
 }
 
 /// `T×C` to `C×T`.

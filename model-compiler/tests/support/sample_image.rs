@@ -40,8 +40,10 @@ pub mod ids {
     pub const BOX: u16 = 23;
     pub const JOINED: u16 = 24;
     pub const PROBABILITIES: u16 = 25;
+    pub const CELLS: u16 = 26;
+    pub const GATHERED: u16 = 27;
     /// First scratch record.
-    pub const SCRATCH: u16 = 26;
+    pub const SCRATCH: u16 = 28;
 }
 
 /// Positions of the sample's steps.
@@ -66,9 +68,10 @@ pub mod at {
     pub const COPY_BOX: usize = 19;
     pub const CONCAT: usize = 20;
     pub const SOFTMAX: usize = 21;
+    pub const GATHER_SUM: usize = 22;
 }
 
-pub const STEPS: usize = 22;
+pub const STEPS: usize = 23;
 
 /// Deterministic constants.
 struct Numbers {
@@ -150,8 +153,13 @@ pub fn parts() -> ImageParts {
             port("bev", ids::LIDAR),
             port("velocity", ids::VELOCITY),
             port("goal", ids::GOAL),
+            port("cells", ids::CELLS),
         ],
-        outputs: vec![port("waypoints", ids::WAYPOINTS), port("probabilities", ids::PROBABILITIES)],
+        outputs: vec![
+            port("waypoints", ids::WAYPOINTS),
+            port("probabilities", ids::PROBABILITIES),
+            port("gathered", ids::GATHERED),
+        ],
         arena_bytes,
         arena_alignment: 16,
         qmodel_digest: [7; 32],
@@ -189,6 +197,8 @@ fn shapes() -> Vec<(Shape, ElementType)> {
         (Shape::map(3, 4, 8), I8),
         (Shape::map(7, 4, 8), I16),
         (Shape::map(7, 4, 8), I16),
+        (Shape::map(2, 3, 6), I8),
+        (Shape::map(2, 3, 8), I16),
     ]
 }
 
@@ -257,6 +267,7 @@ fn steps(n: &mut Numbers) -> Vec<Step> {
         }),
         concat(),
         softmax(n),
+        gather_sum(),
     ]
 }
 
@@ -410,6 +421,18 @@ fn softmax(n: &mut Numbers) -> Step {
         output: TensorId(ids::PROBABILITIES),
         exponent: Requant { shift: 12, ..requant() },
         exp_table: n.builder.push(&exp_table()).expect("fits"),
+    })
+}
+
+fn gather_sum() -> Step {
+    Step::GatherSum(GatherSum {
+        input: TensorId(ids::BLOCK),
+        indices: TensorId(ids::CELLS),
+        output: TensorId(ids::GATHERED),
+        input_zero_point: -3,
+        requant: Requant { shift: 16, ..requant() },
+        zero_point: 0,
+        clamp: clamp(I16),
     })
 }
 

@@ -6,7 +6,7 @@ use model_compiler::import::{NamedTensor, NamedTensors, System, TensorData};
 /// Sizes of a network; the published ones, small ones for fast tests, or an ablation of either.
 #[derive(Clone, Debug)]
 pub struct Network {
-    /// Which of the three waypoint systems.
+    /// Which of the four waypoint systems.
     pub system: System,
     /// Channels of stem and first stage.
     pub stem: usize,
@@ -24,6 +24,10 @@ pub struct Network {
     pub position: bool,
     /// Fusion scales, of 1..=4.
     pub scales: Vec<u8>,
+    /// Geometric Fusion: channels of an embedding.
+    pub embedding: usize,
+    /// Geometric Fusion: outputs of the layers of a projection.
+    pub projection: Vec<usize>,
     /// Outputs of the join layers; the last is the hidden size of the GRU.
     pub join: Vec<usize>,
     /// Input width of the GRU: 2 (added) or 4 (concatenated).
@@ -43,8 +47,10 @@ impl Network {
             grid: (8, 8),
             position: true,
             scales: vec![1, 2, 3, 4],
+            embedding: 512,
+            projection: vec![512; 3],
             join: vec![256, 128, 64],
-            gru_inputs: if system == System::TransFuser { 2 } else { 4 },
+            gru_inputs: if matches!(system, System::TransFuser | System::GeometricFusion) { 2 } else { 4 },
         }
     }
 
@@ -57,6 +63,8 @@ impl Network {
             lidar_blocks: [1; 4],
             layers: 2,
             grid: (2, 2),
+            embedding: 20,
+            projection: vec![24, 12, 28],
             join: vec![24, 16],
             ..Self::published(system)
         }
@@ -70,13 +78,21 @@ impl Network {
     /// Names and shapes of the checkpoint.
     pub fn shapes(&self) -> Vec<(String, Vec<usize>)> {
         let mut list = List(Vec::new());
-        let root = if self.system == System::TransFuser { "encoder." } else { "" };
+        let root = match self.system {
+            System::TransFuser | System::GeometricFusion => "encoder.",
+            _ => "",
+        };
         self.resnet(&mut list, &format!("{root}image_encoder.features"), 3, &self.image_blocks);
         if self.system != System::Aim {
             self.resnet(&mut list, &format!("{root}lidar_encoder._model"), 2, &self.lidar_blocks);
         }
         if self.system == System::TransFuser {
             self.scales.iter().for_each(|&scale| self.transformer(&mut list, scale));
+        }
+        if self.system == System::GeometricFusion {
+            for side in ["image", "lidar"] {
+                (1..=4).for_each(|scale| self.geometric_fusion(&mut list, side, scale));
+            }
         }
         self.head(&mut list);
         list.0
@@ -151,6 +167,20 @@ impl Network {
         list.norm(&format!("{prefix}.ln_f"), c);
     }
 
+    fn geometric_fusion(&self, list: &mut List, side: &str, scale: usize) {
+        let (c, mut input) = (self.widths[scale - 1], self.embedding);
+        let pointwise = |list: &mut List, module: String, outputs: usize, inputs: usize| {
+            list.add(format!("{module}.weight"), &[outputs, inputs, 1, 1]);
+            list.add(format!("{module}.bias"), &[outputs]);
+        };
+        pointwise(list, format!("encoder.{side}_conv{scale}"), input, c);
+        for (layer, &width) in self.projection.iter().enumerate() {
+            list.linear(&format!("encoder.{side}_projection{scale}.{}", 2 * layer), width, input);
+            input = width;
+        }
+        pointwise(list, format!("encoder.{side}_deconv{scale}"), c, input);
+    }
+
     fn head(&self, list: &mut List) {
         let mut input = self.widths[3];
         for (layer, &width) in self.join.iter().enumerate() {
@@ -211,7 +241,7 @@ mod tests {
 
     #[test]
     fn published_networks_have_the_published_names_and_shapes() {
-        for system in [System::Aim, System::LateFusion, System::TransFuser] {
+        for system in [System::Aim, System::LateFusion, System::TransFuser, System::GeometricFusion] {
             let mut shapes = Network::published(system).shapes();
             shapes.sort();
             assert_eq!(shapes, golden::shapes(system), "{}", system.name());

@@ -29,7 +29,8 @@ fn concat_into<T: Code>(axis: Axis, sources: &[ConcatSourceArgs<'_>; 2], output:
     if elements != output.len() as u64 {
         return;
     }
-    for (index, part) in output.chunks_mut(first_run + second_run).enumerate() {
+    let both = first_run.saturating_add(second_run).max(1);
+    for (index, part) in output.chunks_mut(both).enumerate() {
         let Some((front, behind)) = part.split_at_mut_checked(first_run) else { return };
         write(first, index, front);
         write(second, index, behind);

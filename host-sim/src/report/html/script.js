@@ -40,3 +40,22 @@ if (list) {
   list.classList.add("picked");
   show();
 }
+// Attention: one query at a time, the same in both drawings of a frame.
+for (const article of document.querySelectorAll(".looks")) {
+  const groups = [...article.querySelectorAll(".query-keys")];
+  const picks = [...article.querySelectorAll(".pick")];
+  const select = document.createElement("select");
+  const names = new Map(picks.map((pick) => [pick.dataset.query, pick.firstElementChild.textContent]));
+  for (const [query, name] of names) select.append(new Option(name, query));
+  select.value = groups.find((group) => group.classList.contains("shown")).dataset.query;
+  const show = (query) => {
+    select.value = query;
+    for (const group of groups) group.classList.toggle("shown", group.dataset.query === query);
+  };
+  select.addEventListener("change", () => show(select.value));
+  for (const pick of picks) pick.addEventListener("click", () => show(pick.dataset.query));
+  const label = document.createElement("label");
+  label.className = "picker";
+  label.append("Query: ", select);
+  article.querySelector(".columns").before(label);
+}

@@ -9,7 +9,7 @@ use crate::report::tests::{report, step};
 use model_compiler::frames::ByteMap;
 use model_compiler::ir::Shape;
 
-const HOSTILE: &str = "<script>alert('1')</script>\"&'>";
+pub(super) const HOSTILE: &str = "<script>alert('1')</script>\"&'>";
 
 /// Elements that have no end tag in HTML.
 const VOID: [&str; 3] = ["meta", "img", "wbr"];
@@ -59,21 +59,20 @@ fn hostile() -> VerifyReport {
     report
 }
 
-fn frame() -> Frame {
+pub(super) fn frame() -> Frame {
     Frame {
         name: HOSTILE.into(),
         rgb: Some(ByteMap { shape: Shape::map(4, 4, 3), data: (0..48).collect() }),
         bev: Some(ByteMap { shape: Shape::map(4, 4, 2), data: vec![1; 32] }),
         velocity: Some(1.0),
         goal: Some([1.0, -20.0]),
-        command: None,
         dropped_points: 3,
-        label: None,
+        ..Frame::default()
     }
 }
 
 /// Checks that every element is closed in order. Style and script hold no markup, so they are passed over.
-fn assert_well_formed(page: &str) {
+pub(super) fn assert_well_formed(page: &str) {
     let mut open: Vec<&str> = Vec::new();
     let mut rest = page.strip_prefix("<!DOCTYPE html>").expect("an HTML page");
     while let Some(start) = rest.find('<') {
@@ -120,7 +119,8 @@ fn text_from_files_is_escaped() {
 fn nothing_is_fetched() {
     let page = page(&hostile(), &[frame()]).replace("data:image/png;base64,", "");
     for forbidden in ["http", "//", "url(", "@import", "<link", "<iframe", "src=\"/", "fetch("] {
-        let own = page.replace("url(#hatch)", "").replace("// Tables", "").replace("// Tensors", "");
+        let comments = ["// Tables", "// Tensors", "// Attention"];
+        let own = comments.iter().fold(page.replace("url(#hatch)", ""), |page, comment| page.replace(comment, ""));
         assert!(!own.contains(forbidden), "{forbidden}");
     }
 }

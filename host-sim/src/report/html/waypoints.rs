@@ -1,15 +1,13 @@
 //! Where both networks would drive: over the LiDAR histogram, with the camera beside it, worst frame first.
 
+use super::maps::{camera_uri, lidar_uri};
 use super::plot::{line, px};
 use super::{data, table};
 use crate::report::FrameReport;
 use crate::report::figures::figure;
 use crate::run::Waypoints;
-use base64::Engine;
-use base64::prelude::BASE64_STANDARD;
-use image::{ExtendedColorType, ImageEncoder, codecs::png::PngEncoder};
 use maud::{Markup, html};
-use model_compiler::frames::{ByteMap, Frame, bev};
+use model_compiler::frames::{ByteMap, Frame};
 
 /// Frames that are drawn.
 const SHOWN: usize = 6;
@@ -138,34 +136,6 @@ fn tracks(report: &FrameReport, waypoints: &Waypoints, view: View) -> Markup {
     }
 }
 
-/// The histogram from above: rows become columns, right is right, far is up; denser cells are darker.
-fn lidar_uri(map: &ByteMap) -> String {
-    let (rows, columns) = (usize::from(map.shape.height), usize::from(map.shape.width));
-    let channels = usize::from(map.shape.channels);
-    let mut pixels = Vec::with_capacity(2 * rows * columns);
-    for column in 0..columns {
-        for row in (0..rows).rev() {
-            let cell = &map.data[(row * columns + column) * channels..][..channels];
-            let count: u32 = cell.iter().map(|&count| u32::from(count)).sum();
-            let full = u32::from(bev::MAX_COUNT) * channels as u32;
-            let shade = if count == 0 { 0 } else { 80 + 175 * count.min(full) / full };
-            pixels.extend([0, shade as u8]);
-        }
-    }
-    png_uri(&pixels, rows, columns, ExtendedColorType::La8)
-}
-
-fn camera_uri(map: &ByteMap) -> String {
-    png_uri(&map.data, map.shape.width.into(), map.shape.height.into(), ExtendedColorType::Rgb8)
-}
-
-fn png_uri(pixels: &[u8], width: usize, height: usize, color: ExtendedColorType) -> String {
-    let mut bytes = Vec::new();
-    let encoder = PngEncoder::new(&mut bytes);
-    encoder.write_image(pixels, width as u32, height as u32, color).expect("a map has its shape's number of bytes");
-    format!("data:image/png;base64,{}", BASE64_STANDARD.encode(bytes))
-}
-
 fn all(reports: &[FrameReport]) -> Markup {
     let row = |frame: &FrameReport, network: &str, waypoints: &Waypoints| {
         let meters = waypoints.iter().flatten().map(|&meters| figure(Some(meters), 3));
@@ -182,22 +152,4 @@ fn all(reports: &[FrameReport]) -> Markup {
     let columns = (1..=(longest - 2) / 2).flat_map(|k| [format!("right {k}, m"), format!("forward {k}, m")]);
     let header: Vec<String> = ["frame", "network"].map(str::to_owned).into_iter().chain(columns).collect();
     table(&header.iter().map(String::as_str).collect::<Vec<_>>(), 2, &rows)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use firmware::tensor::Shape;
-
-    #[test]
-    fn the_histogram_is_turned_so_that_right_is_right_and_far_is_up() {
-        // Row 0 is rightmost, column 0 farthest: one count there is the upper right corner.
-        let mut map = ByteMap { shape: Shape::map(2, 2, 2), data: vec![0; 8] };
-        map.data[0] = 5;
-        let uri = lidar_uri(&map);
-        let bytes = BASE64_STANDARD.decode(uri.strip_prefix("data:image/png;base64,").unwrap()).unwrap();
-        let image = image::load_from_memory(&bytes).unwrap().into_luma_alpha8();
-        let alpha = |x, y| image.get_pixel(x, y).0[1];
-        assert!(alpha(1, 0) > 100 && alpha(0, 0) == 0 && alpha(0, 1) == 0 && alpha(1, 1) == 0);
-    }
 }

@@ -2,13 +2,28 @@
 
 use super::builder::Builder;
 use super::detect::{common_length, indexed_count};
-use crate::error::Result;
+use crate::error::{Error, ErrorCode, Result};
 use crate::import::NamedTensors;
 use crate::ir::{Clip, Op, ValueId};
 use firmware::program::Window;
 
 /// Channels the LiDAR histogram has in the published networks: below and above the height threshold.
 const LIDAR_CHANNELS: usize = 2;
+
+/// Pixels per position of the last stage: the networks halve the resolution five times.
+pub(super) const TOTAL_STRIDE: u16 = 32;
+
+/// Size of the last stage's map, which divides the maps of all stages by 8, 4, 2, 1: the grid that fusion works on.
+/// `parts` are what it consists of, for the message.
+pub(super) fn grid((height, width): (u16, u16), parts: &str) -> Result<(u16, u16)> {
+    let (rows, columns) = (height / TOTAL_STRIDE, width / TOTAL_STRIDE);
+    if rows == 0 || columns == 0 || height % TOTAL_STRIDE != 0 || width % TOTAL_STRIDE != 0 {
+        let message = format!("an input of {height}×{width} pixels does not divide into {parts}");
+        return Err(Error::new(ErrorCode::Usage, "", message)
+            .with_help(format!("height and width must be multiples of {TOTAL_STRIDE} pixels")));
+    }
+    Ok((rows, columns))
+}
 
 pub(super) struct ResNet {
     prefix: String,

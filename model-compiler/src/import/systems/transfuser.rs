@@ -1,16 +1,14 @@
 //! TransFuser: camera and LiDAR networks, fused by a transformer after each of their stages.
 
 use super::builder::Builder;
-use super::{DEFAULT_RESOLUTION, has, head, resnet::ResNet, transformer::Transformer};
-use crate::error::{Error, ErrorCode, Result};
+use super::resnet::{self, ResNet, TOTAL_STRIDE};
+use super::{DEFAULT_RESOLUTION, has, head, transformer::Transformer};
+use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::{InputKind, Op, Shape};
 
 const IMAGE: &str = "encoder.image_encoder.features";
 const LIDAR: &str = "encoder.lidar_encoder._model";
-
-/// Pixels per token of the last stage: the networks halve the resolution five times.
-const TOTAL_STRIDE: u16 = 32;
 
 pub(super) fn recognize(tensors: &NamedTensors) -> bool {
     has(tensors, "encoder.image_encoder.") || has(tensors, "encoder.transformer")
@@ -19,7 +17,7 @@ pub(super) fn recognize(tensors: &NamedTensors) -> bool {
 /// The ablations with fewer scales lack the first transformers: a scale without one is not fused.
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let resolution = resolution(b);
-    let grid = grid(resolution)?;
+    let grid = resnet::grid(resolution, "tokens")?;
     let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
     let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);
@@ -42,18 +40,6 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     }
     let features = b.push("encoder", Op::GlobalPool, &[image, lidar])?;
     head::waypoints(b, features, 2)
-}
-
-/// Tokens of one map: both maps are enlarged from the token grid by 8, 4, 2, 1, so it is as large as the last stage's
-/// map.
-fn grid((height, width): (u16, u16)) -> Result<(u16, u16)> {
-    let (rows, columns) = (height / TOTAL_STRIDE, width / TOTAL_STRIDE);
-    if rows == 0 || columns == 0 || height % TOTAL_STRIDE != 0 || width % TOTAL_STRIDE != 0 {
-        let message = format!("an input of {height}×{width} pixels does not divide into tokens");
-        return Err(Error::new(ErrorCode::Usage, "", message)
-            .with_help(format!("height and width must be multiples of {TOTAL_STRIDE} pixels")));
-    }
-    Ok((rows, columns))
 }
 
 /// The input size that was asked for, or that a square positional embedding tells, or the published one.

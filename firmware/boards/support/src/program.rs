@@ -1,0 +1,3 @@
+//! The programs that run on a board.
+
+pub mod self_test;

@@ -1,0 +1,76 @@
+//! Self-test: every byte of the image against its CRCs, then the known answer, step by step.
+//!
+//! Prints a line per step (position, operator, instructions) and answers whether all bytes were right. The known answer
+//! is the f64 model's, so this shows that the board computes what the host's independent model computes.
+
+use crate::counter::Counter;
+use crate::machine::Machine;
+use crate::uart::Uart;
+use core::fmt::{self, Write};
+use firmware::engine::{Engine, Progress};
+use firmware::image::Image;
+use firmware::kernels::Kernels;
+
+/// Runs the self-test and answers the exit status: 0 all bytes right, 1 not.
+pub fn run<U: Uart, C: Counter>(
+    machine: &mut Machine<U, C>,
+    image: &[u8],
+    kernels: impl Kernels,
+    arena: &mut [u8],
+) -> u8 {
+    let outcome = test(machine, image, kernels, arena);
+    // A UART takes whatever it is given.
+    let _ = match outcome {
+        Ok(()) => writeln!(machine, "self-test passed"),
+        Err(_) => writeln!(machine, "self-test failed"),
+    };
+    u8::from(outcome.is_err())
+}
+
+fn test<U: Uart, C: Counter>(
+    machine: &mut Machine<U, C>,
+    bytes: &[u8],
+    kernels: impl Kernels,
+    arena: &mut [u8],
+) -> fmt::Result {
+    let board = machine.name;
+    let image = say(machine, Image::parse(bytes))?;
+    writeln!(
+        machine,
+        "{board}: image {}, {} bytes, arena {} of {} bytes",
+        image.name(),
+        bytes.len(),
+        image.arena_bytes(),
+        arena.len()
+    )?;
+    say(machine, image.check())?;
+    let mut engine = say(machine, Engine::new(image, kernels, arena))?;
+    say(machine, engine.start_self_test())?;
+    let mut total = 0;
+    for position in 0.. {
+        let start = machine.counter.ticks();
+        let progress = engine.self_test_step();
+        let ticks = machine.counter.ticks() - start;
+        let progress = say(machine, progress)?;
+        let instructions = machine.counter.instructions(ticks);
+        total += instructions;
+        let name = image.step(position).map_or("?", |step| step.name());
+        writeln!(machine, "{position:4} {name:<18} {instructions:>12}")?;
+        if progress == Progress::Done {
+            break;
+        }
+    }
+    writeln!(machine, "     {:<18} {total:>12} instructions, the CRC of every output included", "total")
+}
+
+/// Prints an error.
+fn say<U: Uart, C: Counter, T, E: fmt::Display>(
+    machine: &mut Machine<U, C>,
+    result: Result<T, E>,
+) -> Result<T, fmt::Error> {
+    result.map_err(|error| {
+        let board = machine.name;
+        let _ = writeln!(machine, "{board}: {error}");
+        fmt::Error
+    })
+}

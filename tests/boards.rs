@@ -1,0 +1,68 @@
+//! Every board computes the bytes of the known answer, which the host's f64 model gave, in every step.
+
+use firmware::image::Image;
+use model_compiler::emit::AlignedBytes;
+use model_compiler::frames::{self, FrameFormat};
+use model_compiler::import::{ImportOptions, System};
+use model_compiler::memory_plan::PlanOptions;
+use model_compiler::passes::PassOptions;
+use model_compiler::pipeline;
+use model_compiler::quantize::QuantizeOptions;
+use model_compiler::target::Target;
+use tests::boards::{ALL, Run};
+use tests::golden::Network;
+use tests::{build, bundle};
+
+const SYSTEMS: [System; 3] = [System::Aim, System::LateFusion, System::TransFuser];
+
+/// The bundled network, compiled for a microcontroller.
+fn bundled() -> Vec<u8> {
+    let (import, passes) = (ImportOptions::default(), PassOptions::default());
+    let graph = pipeline::load_graph(&bundle::checkpoint_path(), &import, &passes).unwrap();
+    let frames = frames::load(&bundle::frames_path("calibration"), &FrameFormat::of_graph(&graph)).unwrap();
+    let model = pipeline::quantize_graph(&graph, &frames, &QuantizeOptions::default(), &mut |_, _, _| {}).unwrap();
+    let target = Target::find("cortex-m4").unwrap();
+    pipeline::compile(&model, &target, &PlanOptions::for_target(&target), &mut |_, _, _| {}).unwrap().image
+}
+
+fn steps(image: &[u8]) -> usize {
+    Image::parse(&AlignedBytes::from(image)).unwrap().step_count().into()
+}
+
+/// Lines of steps: position, operator, instructions.
+fn reported_steps(run: &Run) -> usize {
+    run.console.lines().filter(|line| line.split_whitespace().next().is_some_and(|w| w.parse::<u16>().is_ok())).count()
+}
+
+#[test]
+fn every_board_gives_the_known_answer_of_the_bundled_network() {
+    let image = bundled();
+    for board in ALL {
+        let Some(run) = board.run(&image) else { continue };
+        assert_eq!(run.status, Some(0), "{}:\n{}", board.name, run.console);
+        assert!(run.console.ends_with("self-test passed\n"), "{}:\n{}", board.name, run.console);
+        assert_eq!(reported_steps(&run), steps(&image), "{}:\n{}", board.name, run.console);
+        println!("{}: {}", board.name, run.console.lines().rev().nth(1).unwrap_or_default().trim());
+    }
+}
+
+#[test]
+fn every_system_gives_its_known_answer_on_the_cortex_m4() {
+    for system in SYSTEMS {
+        let model = build::quantized(&build::small(&Network::small(system)), &QuantizeOptions::default());
+        let image = build::compiled_for(&model, "cortex-m4").image;
+        let Some(run) = ALL[0].run(&image) else { return };
+        assert_eq!(run.status, Some(0), "{}:\n{}", system.name(), run.console);
+        assert_eq!(reported_steps(&run), steps(&image), "{}:\n{}", system.name(), run.console);
+    }
+}
+
+#[test]
+fn a_changed_weight_is_noticed_on_the_board() {
+    let mut image = bundled();
+    let middle = image.len() / 2;
+    image[middle] ^= 1;
+    let Some(run) = ALL[0].run(&image) else { return };
+    assert_eq!(run.status, Some(1), "{}", run.console);
+    assert!(run.console.contains("constants section: damaged"), "{}", run.console);
+}

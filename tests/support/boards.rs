@@ -1,0 +1,104 @@
+//! The boards in QEMU: the firmware's own program on an emulated core, with an image in its memory.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// An emulated board.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Board {
+    /// Its package in `firmware/boards`.
+    pub name: &'static str,
+    /// Target of its core.
+    triple: &'static str,
+    emulator: &'static str,
+    machine: &'static [&'static str],
+    /// Where the program looks for the image.
+    image_address: u32,
+}
+
+/// Every board.
+pub const ALL: [Board; 4] = [
+    Board {
+        name: "an386",
+        triple: "thumbv7em-none-eabihf",
+        emulator: "qemu-system-arm",
+        machine: &["mps2-an386"],
+        image_address: 0x2100_0000,
+    },
+    Board {
+        name: "an500",
+        triple: "thumbv7em-none-eabihf",
+        emulator: "qemu-system-arm",
+        machine: &["mps2-an500"],
+        image_address: 0x6000_0000,
+    },
+    Board {
+        name: "an547",
+        triple: "thumbv8m.main-none-eabihf",
+        emulator: "qemu-system-arm",
+        machine: &["mps3-an547"],
+        image_address: 0x6000_0000,
+    },
+    Board {
+        name: "virt",
+        triple: "aarch64-unknown-none",
+        emulator: "qemu-system-aarch64",
+        machine: &["virt", "-cpu", "cortex-a72", "-m", "512M", "-nic", "none"],
+        image_address: 0x5000_0000,
+    },
+];
+
+/// What a run gave.
+#[derive(Clone, Debug)]
+pub struct Run {
+    /// Exit status of the program on the board.
+    pub status: Option<i32>,
+    /// What it wrote to its UART.
+    pub console: String,
+}
+
+impl Board {
+    /// Runs the board's program over an image; `None` where the program or the emulator is missing, which is said past
+    /// the test's capture.
+    ///
+    /// # Panics
+    /// The image cannot be written or the emulator not started.
+    pub fn run(&self, image: &[u8]) -> Option<Run> {
+        let program = self.program();
+        if !program.exists() || !is_installed(self.emulator) {
+            let _ = writeln!(
+                std::io::stderr(),
+                "not run: board {}; tests/run builds {} and installs {} (Debian's package qemu-system-arm)",
+                self.name,
+                program.display(),
+                self.emulator
+            );
+            return None;
+        }
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let file = folder.path().join("model.img");
+        fs::write(&file, image).expect("the image");
+        let output = Command::new(self.emulator)
+            .arg("-M")
+            .args(self.machine)
+            .args(["-display", "none", "-monitor", "none", "-serial", "stdio", "-icount", "shift=6"])
+            .args(["-semihosting-config", "enable=on,target=native", "-device"])
+            .arg(format!("loader,file={},addr={:#x},force-raw=on", file.display(), self.image_address))
+            .arg("-kernel")
+            .arg(program)
+            .output()
+            .unwrap_or_else(|e| panic!("{}: {e}", self.emulator));
+        Some(Run { status: output.status.code(), console: String::from_utf8_lossy(&output.stdout).into_owned() })
+    }
+
+    fn program(&self) -> PathBuf {
+        let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+        root.join("target/mcu").join(self.triple).join("release").join(self.name)
+    }
+}
+
+fn is_installed(program: &str) -> bool {
+    Command::new(program).arg("--version").output().is_ok_and(|output| output.status.success())
+}
