@@ -38,7 +38,7 @@ fn parts(criterion: &mut Criterion) {
     for node in nodes() {
         planner.push(node).expect("128 nodes fit");
     }
-    // Between the first two nodes, out of reach of both: nothing is passed, so every call walks the whole horizon.
+    // Twenty meters beside the route nothing is reached, so every call walks the whole look-ahead.
     let own = Position { north: Real::ZERO, east: Real::from(20) };
     criterion.bench_function("planner", |bench| bench.iter(|| planner.advance(black_box(own))));
 

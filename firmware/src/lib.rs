@@ -1,4 +1,4 @@
-//! Runtime for quantized driving networks: `no_std`, no heap, no float, no panic after validation.
+//! Runtime for quantized driving networks: `no_std`, no heap, no float in inference, no panic after validation.
 //!
 //! A network arrives as a *model image*, written by the compiler and executed in place. The runtime proves once that
 //! the image cannot lead it astray, and then runs it step by step in a buffer that the caller owns:

@@ -88,8 +88,8 @@ impl Controller {
         };
         let steer = self.turn.step(angle).clamp(-Real::ONE, Real::ONE);
 
-        let error = wanted.saturating_sub(speed).clamp(Real::ZERO, max_speed_error);
-        let throttle = self.speed.step(error).clamp(Real::ZERO, max_throttle);
+        let error = wanted.saturating_sub(speed).max(Real::ZERO).min(max_speed_error);
+        let throttle = self.speed.step(error).max(Real::ZERO).min(max_throttle);
         if brake {
             Controls { steer, throttle: Real::ZERO, brake: Real::ONE }
         } else {
@@ -159,6 +159,12 @@ mod tests {
         assert_eq!(first_step(Tuning::TRANSFUSER, 1.0, 1.0, 0.009).steer, Real::ZERO);
         assert_ne!(first_step(Tuning::TRANSFUSER, 1.0, 1.0, 0.011).steer, Real::ZERO);
         assert_ne!(first_step(Tuning::BASELINES, 1.0, 1.0, 0.0).steer, Real::ZERO);
+    }
+
+    #[test]
+    fn bounds_the_wrong_way_round_do_not_panic() {
+        let tuning = Tuning { max_throttle: -Real::ONE, max_speed_error: -Real::ONE, ..Tuning::BASELINES };
+        assert_eq!(first_step(tuning, 0.0, 2.0, 1.0).throttle, -Real::ONE, "the upper bound wins");
     }
 
     #[test]
