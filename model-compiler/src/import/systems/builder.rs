@@ -101,17 +101,32 @@ impl<'a> Builder<'a> {
         self.push(norm, Op::BatchNorm(op), &[map])
     }
 
-    /// Linear layer with bias.
-    pub(super) fn linear(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
-        self.linear_as(module, module, input, outputs)
+    /// Weights and bias of a 1×1 convolution.
+    pub(super) fn pointwise(&mut self, module: &str, inputs: usize, outputs: usize) -> Conv2d {
+        let shape = [outputs, inputs, 1, 1];
+        let values = self.problems.take(&mut self.tensors, &format!("{module}.weight"), &shape);
+        Conv2d {
+            weights: oihw_to_ohwi(&values, shape),
+            bias: Some(self.vector(&format!("{module}.bias"), &shape[..1])),
+            window: Window::square(1, 1, 0),
+            groups: 1,
+            normalization: None,
+            clip: Clip::NONE,
+        }
     }
 
-    /// Linear layer with bias, its result under a name of its own.
-    pub(super) fn linear_as(&mut self, name: &str, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
+    /// Linear layer with bias.
+    pub(super) fn linear(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
         let inputs = usize::from(self.graph.value(input).shape.channels);
+        let linear = self.linear_weights(module, inputs, outputs);
+        self.push(module, Op::Linear(linear), &[input])
+    }
+
+    /// Weights and bias of a linear layer.
+    pub(super) fn linear_weights(&mut self, module: &str, inputs: usize, outputs: usize) -> Linear {
         let weights = self.weights(&format!("{module}.weight"), &[outputs, inputs]);
         let bias = Some(self.vector(&format!("{module}.bias"), &[outputs]));
-        self.push(name, Op::Linear(Linear { weights, bias, clip: Clip::NONE }), &[input])
+        Linear { weights, bias, clip: Clip::NONE }
     }
 
     /// Weight and bias of a LayerNorm, for rows `first_row ..` as a map of `grid`.
