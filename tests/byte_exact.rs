@@ -3,6 +3,7 @@
 use firmware::engine::Engine;
 use firmware::image::Image;
 use firmware::kernels::Portable;
+use firmware::program::{ConstRange, Step};
 use host_sim::backends::Backend;
 use host_sim::buffers::GuardedArena;
 use host_sim::run::ModelInfo;
@@ -10,11 +11,13 @@ use host_sim::verify::{Sources, compare};
 use indicatif::ProgressBar;
 use model_compiler::emit::AlignedBytes;
 use model_compiler::frames::Frame;
-use model_compiler::import::System;
+use model_compiler::import::{ImportOptions, System, import};
 use model_compiler::ir::Graph;
+use model_compiler::passes::optimize;
 use model_compiler::pipeline::Compiled;
 use model_compiler::qmodel::QModel;
 use model_compiler::quantize::{QuantizeOptions, SkipStages};
+use std::collections::BTreeMap;
 use tests::build;
 use tests::golden::{self, Network};
 
@@ -77,5 +80,55 @@ fn full_size_networks_are_byte_exact() {
                 assert_byte_exact(&compiled, &build::frames_of(&graph)[..1], backend);
             }
         }
+    }
+}
+
+/// The ablations of the paper, small.
+fn ablations() -> Vec<(&'static str, Network)> {
+    let base = Network::small(System::TransFuser);
+    vec![
+        ("one scale", Network { scales: vec![4], ..base.clone() }),
+        ("three scales", Network { scales: vec![2, 3, 4], ..base.clone() }),
+        ("one attention layer", Network { layers: 1, ..base.clone() }),
+        ("no positional embedding", Network { position: false, ..base.clone() }),
+        ("shared transformer", Network { shared: Some(16), ..base }),
+    ]
+}
+
+#[test]
+fn ablations_are_byte_exact() {
+    for (what, network) in ablations() {
+        println!("{what}");
+        let options = ImportOptions { resolution: Some(network.resolution()), ..Default::default() };
+        let mut graph = import(what, network.tensors(), &options).unwrap_or_else(|e| panic!("{what}: {e}"));
+        optimize(&mut graph).unwrap_or_else(|e| panic!("{what}: {e}"));
+        let compiled = build::compiled_for(&quantized(&graph, SkipStages::narrow()), "x86");
+        for backend in Backend::all() {
+            assert_byte_exact(&compiled, &build::frames_of(&graph), backend);
+        }
+        assert_self_test_passes(&compiled);
+    }
+}
+
+#[test]
+fn weights_of_a_shared_transformer_are_stored_once() {
+    let network = Network { shared: Some(16), ..Network::small(System::TransFuser) };
+    let model = quantized(&build::small(&network), SkipStages::narrow());
+    let compiled = build::compiled(&model);
+    let bytes = AlignedBytes::from(compiled.image.as_slice());
+    let image = Image::parse(&bytes).unwrap_or_else(|e| panic!("{e}"));
+    let mut ranges: BTreeMap<String, Vec<ConstRange>> = BTreeMap::new();
+    for (position, &index) in compiled.record.plan.order.iter().enumerate() {
+        let name = &model.steps[index as usize].name;
+        let Some((_, module)) = name.strip_prefix("encoder.transformer").and_then(|rest| rest.split_once('.')) else {
+            continue;
+        };
+        if let Some(Step::Linear(step)) = image.step(position as u16) {
+            ranges.entry(module.to_owned()).or_default().push(step.weights);
+        }
+    }
+    assert_eq!(ranges.len(), 2 * 6, "query, key, value, projection and two of the MLP in two layers");
+    for (module, ranges) in ranges {
+        assert!(ranges.len() == 4 && ranges.iter().all(|range| *range == ranges[0]), "{module}: {ranges:?}");
     }
 }

@@ -103,6 +103,27 @@ fn ablations_have_the_sizes_of_the_paper() {
 }
 
 #[test]
+fn a_shared_transformer_counts_once_and_works_at_every_scale() {
+    let network = Network { shared: Some(512), ..Network::published(System::TransFuser) };
+    let mut graph = import_default(network.zeros());
+    assert_eq!(graph.system, "transfuser");
+    assert_eq!(graph.parameters(), 59_902_466);
+    // Two ResNets and the head, four times the transformer of 512 channels, 1×1 convolutions as in Geometric Fusion.
+    let fusion = 4.0 * 3355.44 + 1006.6;
+    assert!((graph.macs() as f64 / 1e6 - (7102.0 + 0.22 + fusion)).abs() < 0.2, "{}", graph.macs());
+    assert_eq!(mega_macs(&graph, "encoder.transformer1"), mega_macs(&graph, "encoder.transformer4"));
+    assert_eq!(shape_of(&graph, "encoder.transformer1.blocks.7"), Shape::tokens(128, 512));
+    assert_eq!(shape_of(&graph, "encoder.image_embedding1"), Shape::map(8, 8, 512));
+    optimize(&mut graph).unwrap_or_else(|e| panic!("{e}"));
+    assert_eq!(count(&graph, "tokens"), 4);
+
+    let two = Network { shared: Some(12), scales: vec![2, 4], ..Network::small(System::TransFuser) };
+    let graph = import_default(two.zeros());
+    assert_eq!((count(&graph, "tokens"), shape_of(&graph, "rgb")), (2, Shape::map(64, 64, 3)));
+    assert!(graph.find("encoder.image_embedding4").is_none(), "nothing to pool at the last stage");
+}
+
+#[test]
 fn transfuser_without_any_scale_has_no_velocity_input() {
     let graph = import_default(Network { scales: vec![], ..Network::small(System::TransFuser) }.zeros());
     assert!(graph.inputs().all(|(_, kind)| kind != InputKind::Velocity));

@@ -244,6 +244,10 @@ mod tests {
                 names(&["encoder.image_encoder.features.conv1.weight", "encoder.transformer4.pos_emb"]),
             ),
             (
+                System::TransFuser,
+                names(&["encoder.transformer.ln_f.weight", "encoder.image_conv1.weight", "encoder.lidar_conv1.weight"]),
+            ),
+            (
                 System::GeometricFusion,
                 names(&["encoder.image_encoder.features.conv1.weight", "encoder.image_conv1.weight"]),
             ),

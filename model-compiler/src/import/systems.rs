@@ -32,9 +32,11 @@ fn has(tensors: &NamedTensors, prefix: &str) -> bool {
 
 /// The system of these names. The order matters: some systems' names include those of a simpler one.
 pub(super) fn detect(tensors: &NamedTensors) -> Option<System> {
-    let recognized: [(System, bool); 6] = [
+    let recognized: [(System, bool); 7] = [
         (System::Lbc, has(tensors, "net.network.backbone.")),
         (System::Cilrs, cilrs::recognize(tensors)),
+        // Its convolutions are named like those of Geometric Fusion.
+        (System::TransFuser, transformer::is_shared(tensors)),
         (System::GeometricFusion, geometric_fusion::recognize(tensors)),
         (System::TransFuser, transfuser::recognize(tensors)),
         (System::LateFusion, late_fusion::recognize(tensors)),

@@ -4,13 +4,14 @@
 
 use super::types::{Stored, Types};
 use crate::error::Result;
-use crate::ir::{Conv2d, Graph, Linear, Node, Op, Shape, ValueId};
+use crate::ir::{Conv2d, Graph, Linear, Node, Op, Shape, ValueId, Weights};
 use crate::reference;
 use firmware::program::Window;
 use ndarray::linalg::general_mat_mul;
 use ndarray::{Array2, ArrayView2};
 use rayon::prelude::*;
 use std::collections::HashMap;
+use std::sync::Arc;
 
 /// The work of a factorization grows with the cube of the depth; deeper layers are left alone.
 const DEEPEST: usize = 1152;
@@ -44,6 +45,47 @@ struct Reader<'a> {
     sums: Vec<Sums>,
 }
 
+/// What was measured of one layer.
+struct Measured<'a> {
+    node: &'a Node,
+    /// Scale of the codes.
+    scale: f64,
+    samples: usize,
+    /// Per group.
+    covariances: Vec<Array2<f64>>,
+}
+
+impl Measured<'_> {
+    /// The covariance over all layers that share this one's weights: such weights are rounded once, so
+    /// that they are stored once.
+    fn with_sharers(&self, all: &[Measured<'_>]) -> Vec<Array2<f64>> {
+        let sharers: Vec<_> = all.iter().filter(|other| weights(other.node) == weights(self.node)).collect();
+        if sharers.len() == 1 {
+            return self.covariances.clone();
+        }
+        // In real units, divided by the same numbers for each of the sharers: they get the same bits.
+        let total: f64 = sharers.iter().map(|layer| layer.samples as f64).sum();
+        let of_group = |group: usize| {
+            let mut sum = Array2::zeros(self.covariances[group].dim());
+            for layer in &sharers {
+                let weight = layer.samples as f64 * layer.scale * layer.scale / total;
+                sum.scaled_add(weight, &layer.covariances[group]);
+            }
+            sum
+        };
+        (0..self.covariances.len()).map(of_group).collect()
+    }
+}
+
+/// The weights of a layer, by identity.
+fn weights(node: &Node) -> Option<*const Weights> {
+    match &node.op {
+        Op::Conv2d(conv) => Some(Arc::as_ptr(&conv.weights)),
+        Op::Linear(linear) => Some(Arc::as_ptr(&linear.weights)),
+        _ => None,
+    }
+}
+
 /// Covariance of the inputs of every layer that has samples enough: by the layer's output, a matrix per group.
 #[derive(Clone, Debug, Default)]
 pub struct Covariances {
@@ -69,11 +111,13 @@ impl Covariances {
             })?;
             readers.par_iter_mut().for_each(|reader| reader.add(&values[&reader.node.inputs[0]]));
         }
-        let of = readers.into_iter().map(|reader| (reader.node.output, reader.covariances())).collect();
+        let measured: Vec<Measured<'_>> = readers.into_iter().map(Reader::measured).collect();
+        let of = measured.iter().map(|layer| (layer.node.output, layer.with_sharers(&measured))).collect();
         Ok(Self { of })
     }
 
-    /// The matrices of a layer, `depth × depth` in squared codes, one per group; `None` where they are not known.
+    /// The matrices of a layer, `depth × depth` in squared codes (or another unit common to the layer), one per group;
+    /// `None` where they are not known.
     pub fn of(&self, output: ValueId) -> Option<&[Array2<f64>]> {
         self.of.get(&output).map(Vec::as_slice)
     }
@@ -155,13 +199,14 @@ impl<'a> Reader<'a> {
         }
     }
 
-    fn covariances(self) -> Vec<Array2<f64>> {
+    fn measured(self) -> Measured<'a> {
         let n = self.samples as f64;
         let covariance = |sums: Sums| {
             let mean: Vec<f64> = sums.codes.iter().map(|sum| sum / n).collect();
             Array2::from_shape_fn(sums.products.dim(), |(i, j)| sums.products[[i, j]] / n - mean[i] * mean[j])
         };
-        self.sums.into_iter().map(covariance).collect()
+        let covariances = self.sums.into_iter().map(covariance).collect();
+        Measured { node: self.node, scale: self.stored.scale, samples: self.samples, covariances }
     }
 }
 
@@ -170,8 +215,7 @@ mod tests {
     use super::super::{QuantizeOptions, types};
     use super::*;
     use crate::calibrate::calibrate;
-    use crate::ir::{Clip, InputKind, Weights};
-    use std::sync::Arc;
+    use crate::ir::{Clip, InputKind};
 
     /// A convolution of two taps, padded on the left, over a map of one row and `width` columns.
     fn graph(width: u16) -> Graph {
@@ -211,6 +255,21 @@ mod tests {
             let expected = mean(&|w| w[i] * w[j]) - mean(&|w| w[i]) * mean(&|w| w[j]);
             assert!((value - expected).abs() < 1e-9, "{i}, {j}: {value}, expected {expected}");
         }
+    }
+
+    #[test]
+    fn layers_that_share_their_weights_get_one_covariance() {
+        let mut graph = graph(2);
+        let Op::Conv2d(conv) = graph.nodes[1].op.clone() else { unreachable!("the second node") };
+        let (x, first) = (graph.nodes[0].output, graph.nodes[1].output);
+        let second = graph.push("second", Op::Conv2d(conv.clone()), &[first]).unwrap();
+        let copy = Conv2d { weights: Arc::new((*conv.weights).clone()), ..conv };
+        let other = graph.push("other", Op::Conv2d(copy), &[x]).unwrap();
+        graph.outputs.extend([second, other]);
+        let frames: Vec<_> = (0..16).map(|i| vec![vec![(i * 37 % 100) as f32, (i * 11 % 90) as f32]]).collect();
+        let found = measured(&graph, &frames);
+        assert_eq!(found.of(first), found.of(second));
+        assert_ne!(found.of(first), found.of(other), "equal weights are not shared ones");
     }
 
     #[test]

@@ -28,6 +28,8 @@ pub struct Network {
     pub embedding: usize,
     /// Geometric Fusion: outputs of the layers of a projection.
     pub projection: Vec<usize>,
+    /// Width of one transformer that all scales share, with 1×1 convolutions to it and back.
+    pub shared: Option<usize>,
     /// Outputs of the join layers; the last is the hidden size of the GRU.
     pub join: Vec<usize>,
     /// Input width of the GRU: 2 (added) or 4 (concatenated).
@@ -53,6 +55,7 @@ impl Network {
             scales: vec![1, 2, 3, 4],
             embedding: 512,
             projection: vec![512; 3],
+            shared: None,
             join: vec![256, 128, 64],
             gru_inputs: if matches!(system, System::TransFuser | System::GeometricFusion) { 2 } else { 4 },
             hidden: 256,
@@ -99,7 +102,16 @@ impl Network {
             self.resnet(&mut list, &format!("{root}lidar_encoder._model"), 2, &self.lidar_blocks);
         }
         if self.system == System::TransFuser {
-            self.scales.iter().for_each(|&scale| self.transformer(&mut list, scale));
+            match self.shared {
+                None => self.scales.iter().for_each(|&scale| {
+                    let width = self.widths[usize::from(scale) - 1];
+                    self.transformer(&mut list, &format!("encoder.transformer{scale}"), width);
+                }),
+                Some(width) => {
+                    self.transformer(&mut list, "encoder.transformer", width);
+                    self.scales.iter().for_each(|&scale| self.projections(&mut list, scale, width));
+                }
+            }
         }
         if self.system == System::GeometricFusion {
             for side in ["image", "lidar"] {
@@ -159,9 +171,18 @@ impl Network {
         }
     }
 
-    fn transformer(&self, list: &mut List, scale: u8) {
-        let prefix = format!("encoder.transformer{scale}");
-        let c = self.widths[usize::from(scale) - 1];
+    fn projections(&self, list: &mut List, scale: u8, width: usize) {
+        let channels = self.widths[usize::from(scale) - 1];
+        for side in ["image", "lidar"] {
+            for (direction, outputs, inputs) in [("conv", width, channels), ("deconv", channels, width)] {
+                let module = format!("encoder.{side}_{direction}{scale}");
+                list.add(format!("{module}.weight"), &[outputs, inputs, 1, 1]);
+                list.add(format!("{module}.bias"), &[outputs]);
+            }
+        }
+    }
+
+    fn transformer(&self, list: &mut List, prefix: &str, c: usize) {
         if self.position {
             list.add(format!("{prefix}.pos_emb"), &[1, 2 * self.grid.0 * self.grid.1, c]);
         }

@@ -117,14 +117,9 @@ impl<'a> Builder<'a> {
 
     /// Linear layer with bias.
     pub(super) fn linear(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
-        self.linear_as(module, module, input, outputs)
-    }
-
-    /// Linear layer with bias, its result under a name of its own.
-    pub(super) fn linear_as(&mut self, name: &str, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
         let inputs = usize::from(self.graph.value(input).shape.channels);
         let linear = self.linear_weights(module, inputs, outputs);
-        self.push(name, Op::Linear(linear), &[input])
+        self.push(module, Op::Linear(linear), &[input])
     }
 
     /// Weights and bias of a linear layer.

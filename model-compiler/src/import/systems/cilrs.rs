@@ -61,7 +61,9 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
         let last = layer == LAYERS[2];
         let module = format!("controller.vel_out.{layer}");
         let outputs = common_length(&b.tensors, &[&format!("{module}.")], |_| true).unwrap_or(HIDDEN);
-        x = b.linear_as(if last { "predicted_speed" } else { &module }, &module, x, if last { 1 } else { outputs })?;
+        let inputs = usize::from(b.graph.value(x).shape.channels);
+        let linear = b.linear_weights(&module, inputs, if last { 1 } else { outputs });
+        x = b.push(if last { "predicted_speed" } else { &module }, Op::Linear(linear), &[x])?;
         if !last {
             x = b.push(format!("controller.vel_out.{}", layer + 1), Op::Clip(Clip::RELU), &[x])?;
         }

@@ -1,58 +1,177 @@
 //! The transformer that fuses an image map and a LiDAR map at one scale.
+//!
+//! As published every scale has a transformer of its own, as wide as its maps. In the ablation of a shared one the same
+//! modules serve all scales, behind 1×1 convolutions to their width and in front of those back to the maps'.
 
 use super::builder::Builder;
 use super::detect::{common_length, indexed_count, most_common};
 use crate::error::Result;
 use crate::import::NamedTensors;
-use crate::ir::{Clip, LayerNorm, Op, Tokens, ValueId, Weights};
+use crate::ir::{Clip, Conv2d, LayerNorm, Linear, Op, Tokens, ValueId, Weights};
+use firmware::program::Window;
 use std::sync::Arc;
 
 /// As published.
 const DEFAULT_HEADS: u16 = 4;
 
-pub(super) struct Transformer {
-    scale: usize,
-    channels: usize,
-    hidden: usize,
-    layers: usize,
-    grid: (u16, u16),
-    position: bool,
-}
+/// Module of the transformer that all scales share.
+const SHARED: &str = "encoder.transformer";
 
 fn prefix(scale: usize) -> String {
-    format!("encoder.transformer{scale}")
+    format!("{SHARED}{scale}")
+}
+
+/// Module of a 1×1 convolution in front of (`conv`) or behind (`deconv`) a shared transformer.
+fn projection(side: &str, direction: &str, scale: usize) -> String {
+    format!("encoder.{side}_{direction}{scale}")
+}
+
+fn has(tensors: &NamedTensors, module: &str) -> bool {
+    tensors.under(&format!("{module}.")).next().is_some()
+}
+
+/// Whether the scales share one transformer.
+pub(super) fn is_shared(tensors: &NamedTensors) -> bool {
+    has(tensors, SHARED)
 }
 
 /// Positional embeddings that are there.
 fn positions(tensors: &NamedTensors) -> impl Iterator<Item = &[usize]> {
-    (1..=4).filter_map(|scale| Some(&tensors.get(&format!("{}.pos_emb", prefix(scale)))?.shape[..]))
+    let modules = (1..=4).map(prefix).chain([SHARED.to_owned()]);
+    modules.filter_map(|module| Some(&tensors.get(&format!("{module}.pos_emb"))?.shape[..]))
+}
+
+/// Tokens that the positional embeddings are made for, both maps together.
+pub(super) fn tokens(tensors: &NamedTensors) -> Option<usize> {
+    most_common(positions(tensors).filter_map(|shape| shape.get(1).copied()))
+}
+
+/// The fusion of each scale that has one.
+pub(super) fn take_all(b: &mut Builder<'_>, widths: &[usize; 4], grid: (u16, u16)) -> [Option<Fusion>; 4] {
+    if !is_shared(&b.tensors) {
+        return std::array::from_fn(|s| {
+            let module = prefix(s + 1);
+            let transformer = has(&b.tensors, &module).then(|| Transformer::take(b, &module, widths[s], grid))?;
+            Some(Fusion { scale: s + 1, transformer, projections: None })
+        });
+    }
+    let attention = |name: &str| name.contains(".attn.");
+    let width = common_length(&b.tensors, &[&format!("{SHARED}.blocks.")], attention).unwrap_or(widths[3]);
+    let transformer = Transformer::take(b, SHARED, width, grid);
+    std::array::from_fn(|s| {
+        let modules = SIDES.map(|side| ["conv", "deconv"].map(|direction| projection(side, direction, s + 1)));
+        if !modules.iter().flatten().any(|module| has(&b.tensors, module)) {
+            return None;
+        }
+        let projections = modules.map(|[conv, deconv]| Projections {
+            to: b.pointwise(&conv, widths[s], width),
+            back: b.pointwise(&deconv, width, widths[s]),
+        });
+        Some(Fusion { scale: s + 1, transformer: transformer.clone(), projections: Some(projections) })
+    })
+}
+
+/// The two maps, in the order of their tokens.
+const SIDES: [&str; 2] = ["image", "lidar"];
+
+/// The modules of a transformer.
+#[derive(Clone)]
+struct Transformer {
+    grid: (u16, u16),
+    embedding: Tokens,
+    blocks: Vec<Block>,
+    norm: LayerNorm,
+}
+
+/// One layer.
+#[derive(Clone)]
+struct Block {
+    norms: [LayerNorm; 2],
+    query: Linear,
+    key: Linear,
+    value: Linear,
+    projection: Linear,
+    mlp: [Linear; 2],
 }
 
 impl Transformer {
-    /// Tokens that the positional embeddings are made for, both maps together.
-    pub(super) fn tokens(tensors: &NamedTensors) -> Option<usize> {
-        most_common(positions(tensors).filter_map(|shape| shape.get(1).copied()))
+    /// Takes the tensors of a module. Embeddings belong to all scales or to none (the ablation without them; where it kept
+    /// its unused zeros in the checkpoint, adding them changes nothing).
+    fn take(b: &mut Builder<'_>, module: &str, channels: usize, grid: (u16, u16)) -> Self {
+        let name = |leaf: &str| format!("{module}.{leaf}");
+        let blocks = name("blocks.");
+        let hidden = common_length(&b.tensors, &[&blocks], |n| n.contains(".mlp.0.")).unwrap_or(4 * channels);
+        let layers = indexed_count(&b.tensors, &blocks).max(1);
+        let count = 2 * usize::from(grid.0) * usize::from(grid.1);
+        let has_position = positions(&b.tensors).next().is_some();
+        let position = has_position.then(|| {
+            let weights = b.weights(&name("pos_emb"), &[1, count, channels]);
+            let data = Arc::unwrap_or_clone(weights).data;
+            Arc::new(Weights { shape: vec![count, channels], data })
+        });
+        let embedding = Tokens {
+            grid,
+            position,
+            velocity_weights: b.vector(&name("vel_emb.weight"), &[channels, 1]),
+            velocity_bias: b.vector(&name("vel_emb.bias"), &[channels]),
+        };
+        let blocks = (0..layers).map(|layer| Block::take(b, &format!("{blocks}{layer}"), channels, hidden, count));
+        let blocks = blocks.collect();
+        Self { grid, embedding, blocks, norm: b.layer_norm(&name("ln_f"), channels, grid) }
+    }
+}
+
+impl Block {
+    fn take(b: &mut Builder<'_>, module: &str, channels: usize, hidden: usize, tokens: usize) -> Self {
+        let name = |leaf: &str| format!("{module}.{leaf}");
+        let norms = ["ln1", "ln2"].map(|leaf| b.layer_norm(&name(leaf), channels, (tokens as u16, 1)));
+        let mut square = |leaf: &str| b.linear_weights(&name(leaf), channels, channels);
+        let (query, key) = (square("attn.query"), square("attn.key"));
+        let (value, projection) = (square("attn.value"), square("attn.proj"));
+        let mlp =
+            [b.linear_weights(&name("mlp.0"), channels, hidden), b.linear_weights(&name("mlp.2"), hidden, channels)];
+        Self { norms, query, key, value, projection, mlp }
     }
 
-    /// The transformer of each scale that has one. Embeddings belong to all scales or to none (the ablation without
-    /// them; where it kept its unused zeros in the checkpoint, adding them changes nothing).
-    pub(super) fn detect_all(tensors: &NamedTensors, widths: &[usize; 4], grid: (u16, u16)) -> [Option<Self>; 4] {
-        let position = positions(tensors).next().is_some();
-        std::array::from_fn(|s| {
-            let p = format!("{}.", prefix(s + 1));
-            tensors.under(&p).next()?;
-            let blocks = format!("{p}blocks.");
-            Some(Self {
-                scale: s + 1,
-                channels: widths[s],
-                hidden: common_length(tensors, &[&blocks], |n| n.contains(".mlp.0.")).unwrap_or(4 * widths[s]),
-                layers: indexed_count(tensors, &blocks).max(1),
-                grid,
-                position,
-            })
-        })
-    }
+    /// Values are named like the modules of a scale's own transformer.
+    fn push(&self, b: &mut Builder<'_>, module: &str, stream: ValueId) -> Result<ValueId> {
+        let name = |leaf: &str| format!("{module}.{leaf}");
+        let linear =
+            |b: &mut Builder<'_>, leaf: &str, linear: &Linear, x| b.push(name(leaf), Op::Linear(linear.clone()), &[x]);
+        let [first, second] = &self.norms;
+        let x = b.push(name("ln1"), Op::LayerNorm(first.clone()), &[stream])?;
+        let query = linear(b, "attn.query", &self.query, x)?;
+        let key = linear(b, "attn.key", &self.key, x)?;
+        let value = linear(b, "attn.value", &self.value, x)?;
+        let attention = Op::Attention { heads: b.options.heads.unwrap_or(DEFAULT_HEADS) };
+        let context = b.push(name("attn.context"), attention, &[query, key, value]);
+        let context = context.map_err(|e| e.with_help("--heads sets the number of heads"))?;
+        let branch = linear(b, "attn.proj", &self.projection, context)?;
+        let stream = b.push(name("attn.add"), Op::Add { clip: Clip::NONE }, &[branch, stream])?;
 
+        let x = b.push(name("ln2"), Op::LayerNorm(second.clone()), &[stream])?;
+        let x = linear(b, "mlp.0", &self.mlp[0], x)?;
+        let x = b.push(name("mlp.1"), Op::Clip(Clip::RELU), &[x])?;
+        let branch = linear(b, "mlp.2", &self.mlp[1], x)?;
+        b.push(module, Op::Add { clip: Clip::NONE }, &[branch, stream])
+    }
+}
+
+/// The 1×1 convolutions of one map at one scale: to the width of a shared transformer, and back.
+struct Projections {
+    to: Conv2d,
+    back: Conv2d,
+}
+
+/// What fuses the maps of one scale.
+pub(super) struct Fusion {
+    scale: usize,
+    transformer: Transformer,
+    /// Of image and LiDAR map, around a shared transformer.
+    projections: Option<[Projections; 2]>,
+}
+
+impl Fusion {
     /// Adds the fused features to both maps.
     pub(super) fn fuse(
         &self,
@@ -62,72 +181,54 @@ impl Transformer {
         velocity: ValueId,
     ) -> Result<(ValueId, ValueId)> {
         let p = prefix(self.scale);
-        let tokens = Op::Tokens(self.embedding(b));
-        let mut stream = b.push(format!("{p}.tokens"), tokens, &[image, lidar, velocity])?;
-        for layer in 0..self.layers {
-            stream = self.block(b, &format!("{p}.blocks.{layer}"), stream)?;
+        let Transformer { grid, embedding, blocks, norm, .. } = &self.transformer;
+        let (image_tokens, lidar_tokens) = (self.project(b, 0, image)?, self.project(b, 1, lidar)?);
+        let tokens = Op::Tokens(embedding.clone());
+        let mut stream = b.push(format!("{p}.tokens"), tokens, &[image_tokens, lidar_tokens, velocity])?;
+        for (layer, block) in blocks.iter().enumerate() {
+            stream = block.push(b, &format!("{p}.blocks.{layer}"), stream)?;
         }
-        let norm = b.layer_norm(&format!("{p}.ln_f"), self.channels, self.grid);
-        let lidar_norm = LayerNorm { first_row: self.grid.0 * self.grid.1, ..norm.clone() };
-        let image = self.add_back(b, "image", norm, stream, image)?;
-        let lidar = self.add_back(b, "lidar", lidar_norm, stream, lidar)?;
+        let lidar_norm = LayerNorm { first_row: grid.0 * grid.1, ..norm.clone() };
+        let image = self.add_back(b, 0, norm.clone(), stream, image)?;
+        let lidar = self.add_back(b, 1, lidar_norm, stream, lidar)?;
         Ok((image, lidar))
     }
 
-    fn embedding(&self, b: &mut Builder<'_>) -> Tokens {
-        let p = prefix(self.scale);
-        let tokens = 2 * usize::from(self.grid.0) * usize::from(self.grid.1);
-        let position = self.position.then(|| {
-            let weights = b.weights(&format!("{p}.pos_emb"), &[1, tokens, self.channels]);
-            let data = Arc::unwrap_or_clone(weights).data;
-            Arc::new(Weights { shape: vec![tokens, self.channels], data })
-        });
-        Tokens {
-            grid: self.grid,
-            position,
-            velocity_weights: b.vector(&format!("{p}.vel_emb.weight"), &[self.channels, 1]),
-            velocity_bias: b.vector(&format!("{p}.vel_emb.bias"), &[self.channels]),
+    /// A map in the width of a shared transformer, pooled to the token grid; without projections the map itself.
+    fn project(&self, b: &mut Builder<'_>, side: usize, map: ValueId) -> Result<ValueId> {
+        let Some(projections) = &self.projections else { return Ok(map) };
+        let (name, conv) = (SIDES[side], projections[side].to.clone());
+        let features = b.push(projection(name, "conv", self.scale), Op::Conv2d(conv), &[map])?;
+        let size = b.graph.value(map).shape;
+        let (height, width) = (size.height / self.transformer.grid.0, size.width / self.transformer.grid.1);
+        if (height, width) == (1, 1) {
+            return Ok(features);
         }
-    }
-
-    fn block(&self, b: &mut Builder<'_>, module: &str, stream: ValueId) -> Result<ValueId> {
-        let name = |leaf: &str| format!("{module}.{leaf}");
-        let rows = (b.graph.value(stream).shape.height, 1);
-        let norm = b.layer_norm(&name("ln1"), self.channels, rows);
-        let x = b.push(name("ln1"), Op::LayerNorm(norm), &[stream])?;
-        let query = b.linear(&name("attn.query"), x, self.channels)?;
-        let key = b.linear(&name("attn.key"), x, self.channels)?;
-        let value = b.linear(&name("attn.value"), x, self.channels)?;
-        let attention = Op::Attention { heads: b.options.heads.unwrap_or(DEFAULT_HEADS) };
-        let context = b.push(name("attn.context"), attention, &[query, key, value]);
-        let context = context.map_err(|e| e.with_help("--heads sets the number of heads"))?;
-        let branch = b.linear(&name("attn.proj"), context, self.channels)?;
-        let stream = b.push(name("attn.add"), Op::Add { clip: Clip::NONE }, &[branch, stream])?;
-
-        let norm = b.layer_norm(&name("ln2"), self.channels, rows);
-        let x = b.push(name("ln2"), Op::LayerNorm(norm), &[stream])?;
-        let x = b.linear(&name("mlp.0"), x, self.hidden)?;
-        let x = b.push(name("mlp.1"), Op::Clip(Clip::RELU), &[x])?;
-        let branch = b.linear(&name("mlp.2"), x, self.channels)?;
-        b.push(module, Op::Add { clip: Clip::NONE }, &[branch, stream])
+        let cell = Window { kernel_h: height as u8, kernel_w: width as u8, ..Window::square(1, 1, 0) };
+        let window = Window { stride_h: cell.kernel_h, stride_w: cell.kernel_w, ..cell };
+        b.push(format!("encoder.{name}_embedding{}", self.scale), Op::AveragePool(window), &[features])
     }
 
     /// Final LayerNorm of one map's tokens, enlarged to the map's size and added to it.
     fn add_back(
         &self,
         b: &mut Builder<'_>,
-        side: &str,
+        side: usize,
         norm: LayerNorm,
         stream: ValueId,
         map: ValueId,
     ) -> Result<ValueId> {
-        let p = prefix(self.scale);
-        let mut branch = b.push(format!("{p}.ln_f.{side}"), Op::LayerNorm(norm), &[stream])?;
+        let (p, name, grid) = (prefix(self.scale), SIDES[side], self.transformer.grid);
+        let mut branch = b.push(format!("{p}.ln_f.{name}"), Op::LayerNorm(norm), &[stream])?;
         let size = b.graph.value(map).shape;
-        let factor = (size.height / self.grid.0, size.width / self.grid.1);
+        let factor = (size.height / grid.0, size.width / grid.1);
         if factor != (1, 1) {
-            branch = b.push(format!("{p}.upsample.{side}"), Op::ResizeBilinear { factor }, &[branch])?;
+            branch = b.push(format!("{p}.upsample.{name}"), Op::ResizeBilinear { factor }, &[branch])?;
         }
-        b.push(format!("{p}.add.{side}"), Op::Add { clip: Clip::NONE }, &[branch, map])
+        if let Some(projections) = &self.projections {
+            let conv = Op::Conv2d(projections[side].back.clone());
+            branch = b.push(projection(name, "deconv", self.scale), conv, &[branch])?;
+        }
+        b.push(format!("{p}.add.{name}"), Op::Add { clip: Clip::NONE }, &[branch, map])
     }
 }

@@ -2,7 +2,7 @@
 
 use super::builder::Builder;
 use super::resnet::{self, ResNet, TOTAL_STRIDE};
-use super::{DEFAULT_RESOLUTION, has, head, transformer::Transformer};
+use super::{DEFAULT_RESOLUTION, has, head, transformer};
 use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::{InputKind, Op, Shape};
@@ -21,7 +21,7 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
     let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);
-    let scales = Transformer::detect_all(&b.tensors, &image_network.widths, grid);
+    let scales = transformer::take_all(b, &image_network.widths, grid);
 
     let rgb = b.rgb("encoder.image_encoder", resolution)?;
     let bev = b.bev(resolution, channels);
@@ -34,8 +34,8 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     for (stage, scale) in (1..=4).zip(&scales) {
         image = image_network.stage(b, stage, image)?;
         lidar = lidar_network.stage(b, stage, lidar)?;
-        if let (Some(transformer), Some(velocity)) = (scale, velocity) {
-            (image, lidar) = transformer.fuse(b, image, lidar, velocity)?;
+        if let (Some(fusion), Some(velocity)) = (scale, velocity) {
+            (image, lidar) = fusion.fuse(b, image, lidar, velocity)?;
         }
     }
     let features = b.push("encoder", Op::GlobalPool, &[image, lidar])?;
@@ -45,7 +45,7 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
 /// The input size that was asked for, or that a square positional embedding tells, or the published one.
 fn resolution(b: &Builder<'_>) -> (u16, u16) {
     b.options.resolution.unwrap_or_else(|| {
-        let tokens = Transformer::tokens(&b.tensors).unwrap_or(0);
+        let tokens = transformer::tokens(&b.tensors).unwrap_or(0);
         let side = (tokens / 2).isqrt();
         if (1..=64).contains(&side) && 2 * side * side == tokens {
             let pixels = side as u16 * TOTAL_STRIDE;
