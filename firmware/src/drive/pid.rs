@@ -1,7 +1,7 @@
 //! The PID controller of the published agents.
 
 use super::Real;
-use heapless::HistoryBuf;
+use heapless::Deque;
 
 /// Errors that the integral part looks back on.
 pub const WINDOW: usize = 40;
@@ -24,26 +24,30 @@ pub struct Gains {
 #[derive(Clone, Debug)]
 pub struct Pid {
     gains: Gains,
-    errors: HistoryBuf<Real, WINDOW>,
+    /// The errors so far, the zeros before them left out.
+    errors: Deque<Real, WINDOW>,
 }
 
 impl Pid {
     /// Starts from no error.
-    pub fn new(gains: Gains) -> Self {
-        Self { gains, errors: HistoryBuf::new_with(Real::ZERO) }
+    pub const fn new(gains: Gains) -> Self {
+        Self { gains, errors: Deque::new() }
     }
 
     /// Forgets all errors.
     pub fn reset(&mut self) {
-        self.errors.clear_with(Real::ZERO);
+        self.errors.clear();
     }
 
     /// Takes the error of this step and gives the controlled value, unclamped (it saturates at the type's ends).
     pub fn step(&mut self, error: Real) -> Real {
-        let before = self.errors.recent().copied().unwrap_or(Real::ZERO);
-        self.errors.write(error);
-        // The order of a sum that does not saturate is irrelevant.
-        let sum = self.errors.as_slice().iter().fold(Real::ZERO, |sum, &e| sum.saturating_add(e));
+        let before = self.errors.back().copied().unwrap_or(Real::ZERO);
+        if self.errors.is_full() {
+            self.errors.pop_front();
+        }
+        // There is room.
+        let _ = self.errors.push_back(error);
+        let sum = self.errors.iter().fold(Real::ZERO, |sum, &e| sum.saturating_add(e));
         let mean = sum.checked_div_int(WINDOW as i64).unwrap_or(Real::ZERO);
         let Gains { proportional, integral, derivative } = self.gains;
         let proportional = proportional.saturating_mul(error);

@@ -52,10 +52,12 @@ impl System {
     /// The system as published. The authors' TransFuser agent alone has a substitute for a compass that is not a
     /// number; their other agents would pass the NaN on to the network.
     pub const fn profile(self) -> Profile {
+        const HORIZON: Horizon = Horizon { reach: Real::lit("4"), look_ahead: Real::lit("50") };
+        const LBC_HORIZON: Horizon = Horizon { reach: Real::lit("7.5"), look_ahead: Real::lit("25") };
         let published = Profile {
             answer: Answer::Waypoints,
             tuning: Tuning::BASELINES,
-            horizon: Horizon { reach: Real::lit("4"), look_ahead: Real::lit("50") },
+            horizon: HORIZON,
             cadence: Cadence::EveryStep,
             substitute_heading: None,
             limits: Limits::new(true, true),
@@ -73,7 +75,7 @@ impl System {
             Self::Cilrs => Profile { answer: Answer::Controls, limits: Limits::new(false, false), ..published },
             Self::Lbc => Profile {
                 answer: Answer::ImagePoints(Camera::LBC),
-                horizon: Horizon { reach: Real::lit("7.5"), look_ahead: Real::lit("25") },
+                horizon: LBC_HORIZON,
                 limits: camera_only,
                 ..published
             },

@@ -163,6 +163,9 @@ impl Limits {
     pub const fn new(lidar: bool, compass: bool) -> Self {
         const FAST: u16 = 100;
         const SLOW: u16 = 200;
+        const SPEED: Real = Real::lit("100");
+        const POSITION: Real = Real::lit("32000");
+        const WAYPOINT: Real = Real::lit("128");
         Self {
             age_ms: [
                 Some(FAST),
@@ -171,9 +174,9 @@ impl Limits {
                 Some(SLOW),
                 if compass { Some(SLOW) } else { None },
             ],
-            speed: Real::lit("100"),
-            position: Real::lit("32000"),
-            waypoint: Real::lit("128"),
+            speed: SPEED,
+            position: POSITION,
+            waypoint: WAYPOINT,
             recovery_steps: 10,
         }
     }

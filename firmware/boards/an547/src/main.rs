@@ -27,9 +27,8 @@ fn main() -> ! {
     let (uart, counter) = unsafe { (CmsdkUart::new(UART), SystemCounter::new(COUNTER, COUNTER_HERTZ)) };
     let mut machine = Machine { name: "an547", uart, counter };
     // SAFETY: DDR of the board that nothing else uses; this program never writes the image's part.
-    let (image, arena) = unsafe {
-        (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES))
-    };
+    let (image, arena) =
+        unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
     semihosting::exit(program::self_test::run(&mut machine, image, Portable, arena))
 }
 

@@ -1,5 +1,6 @@
 //! Links only if no panic is reachable: the panic handler calls a symbol that nothing defines, so that one reachable
-//! panic is a link error. What is linked is what drives: parse, check, inference, self-test, the waypoints.
+//! panic is a link error. What is linked is what drives: parse, check, inference, self-test, waypoints, every sensor and the
+//! driver of all systems.
 //!
 //! The program is not meant to run. Each `twin-*` feature adds one panic of a usual kind and must not link.
 #![no_std]
@@ -7,9 +8,15 @@
 
 use core::hint::black_box;
 use core::panic::PanicInfo;
+use firmware::drive::{Driver, Measurements, NetworkOutput, RouteNode, Step, System};
 use firmware::engine::{Engine, Progress};
 use firmware::image::Image;
 use firmware::kernels::Portable;
+use firmware::sensors::camera::{Camera, CameraLayout};
+use firmware::sensors::correspondences::{Correspondences, Intrinsics};
+use firmware::sensors::lidar::{Histogram, Motion, Mounting, Pose, Sweep};
+use firmware::sensors::{heatmap, inputs};
+use firmware::waypoint::Waypoint;
 
 unsafe extern "C" {
     safe fn a_panic_is_reachable() -> !;
@@ -24,7 +31,10 @@ fn panic(_: &PanicInfo<'_>) -> ! {
 #[unsafe(no_mangle)]
 pub extern "C" fn start() -> bool {
     let mut arena = [0; 64];
-    infer(black_box(&[]), black_box(&mut arena), black_box(&[])).is_some() && twin(black_box(&[]))
+    infer(black_box(&[]), black_box(&mut arena), black_box(&[])).is_some()
+        & sense(black_box(&Raw::default())).is_some()
+        & drive(black_box(&Trip::default()))
+        & twin(black_box(&[]))
 }
 
 fn infer(image: &[u8], arena: &mut [u8], inputs: &[&[u8]]) -> Option<()> {
@@ -36,6 +46,78 @@ fn infer(image: &[u8], arena: &mut [u8], inputs: &[&[u8]]) -> Option<()> {
     while engine.step().ok()? != Progress::Done {}
     black_box(engine.output(0).ok()?);
     black_box(engine.waypoints(0).ok()?);
+    Some(())
+}
+
+/// What sensors send, none of it trusted.
+#[derive(Default)]
+struct Raw<'a> {
+    layout: Option<CameraLayout>,
+    memory: [u16; 8],
+    bytes: &'a [u8],
+    stride: u32,
+    points: &'a [[u32; 3]],
+    poses: Option<(Mounting, [Pose; 2])>,
+    intrinsics: Option<Intrinsics>,
+    numbers: [u32; 3],
+}
+
+fn sense(raw: &Raw<'_>) -> Option<()> {
+    let (mut memory, mut map, mut other) = (raw.memory, [0; 64], [0; 64]);
+    let mut camera = Camera::new(raw.layout?, black_box(&mut memory)).ok()?;
+    black_box(camera.push(raw.stride, raw.numbers[0], raw.bytes, black_box(&mut map))).ok()?;
+    black_box(camera.push_image(raw.bytes, raw.stride, black_box(&mut map))).ok()?;
+    black_box(camera.finish()).ok()?;
+
+    let (mounting, [capture, current]) = raw.poses?;
+    let motion = Motion::between(&capture, &current);
+    let points = || raw.points.iter().map(|&bits| mounting.place(bits).map(|point| motion.apply(point)));
+    for histogram in [Histogram::TRANSFUSER, Histogram::BASELINES] {
+        let mut sweep = Sweep::new(histogram, black_box(&mut map)).ok()?;
+        points().for_each(|point| sweep.push(point));
+        black_box(sweep.finish());
+    }
+    let mut cells = Correspondences::new(raw.intrinsics?, black_box(&mut map), black_box(&mut other)).ok()?;
+    points().for_each(|point| cells.push(point));
+    black_box(cells.finish());
+
+    let [a, b, c] = raw.numbers;
+    heatmap::draw(inputs::goal([a, b]).ok()?, black_box(&mut map)).ok()?;
+    black_box((inputs::velocity(c).ok()?, inputs::command(c as u8).ok()?));
+    Some(())
+}
+
+/// What a driver is given, none of it trusted.
+#[derive(Default)]
+struct Trip<'a> {
+    measurements: Option<Measurements>,
+    nodes: &'a [RouteNode],
+    waypoints: &'a [Waypoint],
+    points: &'a [[i32; 2]],
+    controls: [i16; 3],
+}
+
+fn drive(trip: &Trip<'_>) -> bool {
+    let systems =
+        [System::TransFuser, System::Aim, System::LateFusion, System::GeometricFusion, System::Cilrs, System::Lbc];
+    systems.into_iter().all(|system| drive_by(trip, system).is_some())
+}
+
+fn drive_by(trip: &Trip<'_>, system: System) -> Option<()> {
+    let mut driver: Driver = Driver::new(black_box(system.profile()));
+    for node in trip.nodes {
+        driver.route().push(*node).ok()?;
+    }
+    for answer in [
+        NetworkOutput::Waypoints(trip.waypoints),
+        NetworkOutput::ImagePoints(trip.points),
+        NetworkOutput::Controls(trip.controls),
+    ] {
+        match driver.step(trip.measurements.as_ref()?) {
+            Step::Network(pending) => black_box(pending.finish(Ok(answer))),
+            Step::Done(output) => black_box(output),
+        };
+    }
     Some(())
 }
 

@@ -29,9 +29,8 @@ impl CmsdkUart {
     /// Such a UART lies at this address, and nothing else drives it.
     pub unsafe fn new(base: usize) -> Self {
         // SAFETY: registers of the UART that the caller vouches for.
-        let [data, state, control, divider] = unsafe {
-            [Register::at(base), Register::at(base + 4), Register::at(base + 8), Register::at(base + 0x10)]
-        };
+        let [data, state, control, divider] =
+            unsafe { [Register::at(base), Register::at(base + 4), Register::at(base + 8), Register::at(base + 0x10)] };
         divider.write(16);
         control.write(Self::TRANSMIT_AND_RECEIVE);
         Self { data, state }

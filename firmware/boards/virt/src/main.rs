@@ -63,9 +63,8 @@ extern "C" fn main() -> ! {
     let uart = unsafe { Pl011::new(UART) };
     let mut machine = Machine { name: "virt", uart, counter: GenericTimer };
     // SAFETY: RAM of the board that nothing else uses; this program never writes the image's part.
-    let (image, arena) = unsafe {
-        (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES))
-    };
+    let (image, arena) =
+        unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
     semihosting::exit(program::self_test::run(&mut machine, image, Portable, arena))
 }
 

@@ -23,7 +23,7 @@ pub fn gather_sum(args: &GatherSumArgs<'_>, input: Codes<'_>, output: CodesMut<'
 
 fn gather_sum_into<I: Code, O: Code>(args: &GatherSumArgs<'_>, input: &[I], output: &mut [O]) {
     let channels = usize::from(args.output_shape.channels);
-    let positions = output.len().checked_div(channels).unwrap_or_default();
+    let Some(positions) = output.len().checked_div(channels) else { return };
     let pair_bytes = args.indices.len().checked_div(positions).unwrap_or_default();
     let fits = args.input_shape.elements() == input.len() as u64 && args.output_shape.elements() == output.len() as u64;
     let whole = pair_bytes.is_multiple_of(2) && pair_bytes * positions == args.indices.len();
