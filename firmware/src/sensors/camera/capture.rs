@@ -321,24 +321,18 @@ impl View<'_> {
     /// Writes colors and returns their share of the frame's hash.
     fn write(&mut self, colors: impl Iterator<Item = [u8; 3]>) -> u32 {
         let mut hash = 0_u32;
-        let positions = self.position..;
-        if self.channels == 3 {
-            let pixels = self.codes.as_chunks_mut::<3>().0;
-            for ((codes, color), position) in pixels.iter_mut().zip(colors).zip(positions) {
-                *codes = color.map(code);
-                hash = hash.wrapping_add(share(color, position));
-            }
-            return hash;
-        }
-        let pixels = self.codes.chunks_mut(self.channels.max(1));
-        for ((codes, color), position) in pixels.zip(colors).zip(positions) {
-            match codes.get_mut(self.first_channel..) {
+        let first = self.first_channel;
+        let mut pixels = self.codes.chunks_mut(self.channels.max(1)).zip(self.position..);
+        // From inside the iterator, which is faster where pixels come in pairs.
+        colors.for_each(|color| {
+            let Some((codes, position)) = pixels.next() else { return };
+            match codes.get_mut(first..) {
                 Some([red, green, blue, ..]) => [*red, *green, *blue] = color.map(code),
                 Some([grey, ..]) => [*grey, _, _] = color.map(code),
                 _ => {}
             }
             hash = hash.wrapping_add(share(color, position));
-        }
+        });
         hash
     }
 
@@ -376,16 +370,17 @@ struct Store<'a> {
 
 impl Visitor for Store<'_> {
     fn visit(self, components: impl Iterator<Item = [u8; 3]>, _: impl Fn([u8; 3]) -> [u8; 3]) {
-        let pixels = self.view.codes.chunks_mut(self.view.channels.max(1));
-        for (codes, components) in pixels.zip(components) {
-            let Some([first, second, third, ..]) = codes.get_mut(self.view.first_channel..) else { continue };
+        let mut pixels = self.view.codes.chunks_mut(self.view.channels.max(1));
+        components.for_each(|components| {
+            let codes = pixels.next().and_then(|codes| codes.get_mut(self.view.first_channel..));
+            let Some([first, second, third, ..]) = codes else { return };
             let [y, u, v] = components.map(code);
             if self.is_chroma {
                 [*second, *third] = [u, v];
             } else {
                 *first = y;
             }
-        }
+        });
     }
 }
 
@@ -400,12 +395,15 @@ struct Add<'a> {
 impl Visitor for Add<'_> {
     fn visit(self, components: impl Iterator<Item = [u8; 3]>, _: impl Fn([u8; 3]) -> [u8; 3]) {
         let sums = self.sums.as_chunks_mut::<3>().0;
-        for (components, column) in components.zip(self.column..) {
-            let Some(sums) = sums.get_mut(index(column.wrapping_shr(self.bits))) else { return };
-            for (sum, component) in sums.iter_mut().zip(components) {
-                *sum = sum.wrapping_add(self.weight.wrapping_mul(component.into()));
+        let mut column = self.column;
+        components.for_each(|components| {
+            if let Some(sums) = sums.get_mut(index(column.wrapping_shr(self.bits))) {
+                for (sum, component) in sums.iter_mut().zip(components) {
+                    *sum = sum.wrapping_add(self.weight.wrapping_mul(component.into()));
+                }
             }
-        }
+            column = column.wrapping_add(1);
+        });
     }
 }
 

@@ -138,7 +138,7 @@ fn layouts() -> impl Strategy<Value = CameraLayout> {
             scale,
             map: Shape::map(height, width, channels),
             first_channel: if is_grey { 0 } else { (channels - 3).min(channel) },
-            frozen_after: 2,
+            frozen_after: 0,
         }
     })
 }
