@@ -126,6 +126,21 @@ fn both_networks_are_counted_and_compared() {
 }
 
 #[test]
+fn a_missed_agreement_is_exit_status_one() {
+    let project = Project::new(System::TransFuser);
+    let both = "attention net.img --model net.safetensors --inputs inputs.safetensors";
+    let outcome = project.host_sim(&format!("{both} --min-agreement 10"));
+    assert!(outcome.status == 0 && outcome.out.contains("gate min_agreement_percent met"), "{}", outcome.out);
+    let outcome = project.host_sim(&format!("{both} --top 1 --min-agreement 100"));
+    let (status, document) = project.json(&format!("{both} --top 1 --min-agreement 100 --json"));
+    let is_exact = document["agreement"]["keys_percent"] == 100.0;
+    assert!(!is_exact, "integers that agree on every key cannot miss a gate: choose another seed of the network");
+    assert_eq!((outcome.status, status), (1, 1));
+    assert!(outcome.err.contains("error: gate min_agreement_percent: least on frame inputs#"), "{}", outcome.err);
+    assert_eq!((&document["error"]["code"], &document["gates"][0]["met"]), (&"check".into(), &false.into()));
+}
+
+#[test]
 fn every_backend_has_the_same_rows() {
     use host_sim::backends::Backend;
     let project = Project::new(System::TransFuser);
@@ -167,6 +182,7 @@ fn bad_input_is_exit_status_two_and_says_what_to_do() {
         (format!("attention alone.img {inputs} --block encoder.transformer2"), "without its record have no names"),
         (format!("attention net.img {inputs} --image-rows 0,2"), "expected rows 0 to 1 of the token map"),
         (format!("attention net.img {inputs} --top 5"), "--top: found 5, expected 1 to 4"),
+        (format!("attention net.img {inputs} --min-agreement 90"), "needs the integers and the f32 network"),
         (format!("attention net.safetensors --model net.safetensors {inputs}"), "this is no model image"),
         (format!("attention net.img --model net.safetensors --heads 2 {inputs}"), "that the image was compiled from"),
     ] {

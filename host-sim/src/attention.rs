@@ -13,6 +13,7 @@
 
 use crate::backends::Backend;
 use crate::files::{self, FrameSource, ImageFile};
+use crate::gates::{self, GateOutcome};
 use crate::report::json;
 use crate::run::ModelInfo;
 use crate::verify::calibration_digests;
@@ -75,6 +76,8 @@ pub struct Options {
     pub rows: QueryRows,
     /// Strongest keys of each query and head; 5 if not given, fewer where a sensor has fewer tokens.
     pub top: Option<u16>,
+    /// Fewest of the strongest keys that both networks must have in common, percent.
+    pub min_agreement_percent: Option<f64>,
 }
 
 /// Result of the measurement.
@@ -101,6 +104,12 @@ pub struct AttentionReport {
     pub calibration_frames: Vec<String>,
     /// Every frame, in order.
     pub frames: Vec<FrameAttention>,
+    /// The gate on the agreement, where one was asked for.
+    pub gates: Vec<GateOutcome>,
+    /// Why the gate was missed; absent where it was not.
+    #[serde(rename = "error", skip_serializing_if = "Option::is_none", serialize_with = "json::failure")]
+    #[schemars(with = "json::Failure")]
+    pub failure: Option<Error>,
 }
 
 /// One of the two networks.
@@ -139,7 +148,8 @@ pub struct Measured {
 ///
 /// # Errors
 /// A file cannot be read, the files do not belong together, the network fuses no sensors, a row or the number of keys
-/// is out of range; [`ErrorCode::Check`] where the rows do not explain the engine's bytes.
+/// is out of range; [`ErrorCode::Check`] where the rows do not explain the engine's bytes. A missed gate is in the
+/// report, no error.
 pub fn attention(options: &Options, progress: &ProgressBar) -> Result<Measured> {
     let file = match files::is_image_file(&options.model)? {
         true => Some(ImageFile::read(&options.model)?),
@@ -210,7 +220,7 @@ pub fn attention(options: &Options, progress: &ProgressBar) -> Result<Measured> 
     };
     let known = record.as_ref().map(|record| calibration_digests(&record.model)).unwrap_or_default();
     let overlap = frames::overlap(&known, &frames).into_iter().map(str::to_owned).collect();
-    let report = AttentionReport {
+    let mut report = AttentionReport {
         schema: json::SCHEMA,
         block: block.name,
         heads: block.heads,
@@ -221,6 +231,12 @@ pub fn attention(options: &Options, progress: &ProgressBar) -> Result<Measured> 
         float,
         calibration_frames: overlap,
         frames: results,
+        gates: Vec::new(),
+        failure: None,
     };
+    if let Some(limit) = options.min_agreement_percent {
+        report.gates.push(gates::attention_agreement(&report, limit)?);
+        report.failure = gates::failure(&report.gates);
+    }
     Ok(Measured { report, frames })
 }

@@ -10,8 +10,8 @@ use crate::files::FrameSource;
 use crate::gates::{self, Gates};
 use crate::noise::{self, Selection};
 use crate::report::{self, VerifyReport, html, json, terminal};
-use crate::{attention, bench, demo, metrics, run, verify};
-use attention_args::AttentionArgs;
+use crate::{bench, demo, metrics, run, verify};
+use attention::AttentionArgs;
 use clap::{Args, Parser, Subcommand};
 use indicatif::ProgressBar;
 use model_compiler::artifact;
@@ -21,7 +21,7 @@ use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-mod attention_args;
+mod attention;
 mod examples;
 
 pub use model_compiler::cli::Console;
@@ -114,26 +114,8 @@ enum Command {
     /// How often tokens of one sensor attend to the other in a fusing transformer: integers, f32, and how far they agree.
     #[command(after_help = examples::ATTENTION)]
     Attention {
-        /// Model image (OUT.img), or a checkpoint for its f32 network alone.
-        #[arg(value_name = "OUT.img|MODEL")]
-        model: PathBuf,
-        /// The checkpoint that the image was compiled from; without it only the integers are looked at.
-        #[arg(long = "model", value_name = "MODEL")]
-        checkpoint: Option<PathBuf>,
-        #[command(flatten)]
-        import: ImportArgs,
-        #[command(flatten)]
-        frames: FrameSource,
-        #[command(flatten)]
-        backend: BackendArgs,
-        /// Build record of the image, for the names of its blocks [default: OUT.record beside OUT.img, if it is there].
-        #[arg(long, value_name = "FILE")]
-        record: Option<PathBuf>,
         #[command(flatten)]
         attention: AttentionArgs,
-        /// Write attention.html and attention.json to this folder.
-        #[arg(long, value_name = "DIR")]
-        report: Option<PathBuf>,
         #[command(flatten)]
         common: Common,
     },
@@ -345,7 +327,7 @@ fn show(out: Option<PathBuf>, json: bool, console: &mut Console<'_>, progress: &
     if json {
         console.print(&json::verify(&report).to_string());
     }
-    Ok(conclude(&report, json, console))
+    Ok(conclude(report.failure.as_ref(), json, console))
 }
 
 impl Command {
@@ -397,7 +379,7 @@ impl Command {
                 let report = verified.report;
                 warn(&report, console);
                 console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
-                Ok(conclude(&report, common.json, console))
+                Ok(conclude(report.failure.as_ref(), common.json, console))
             }
             Self::Ablate { model, import, calib, frames, mirror, common } => {
                 let options = ablation::Options { model, import: import.options()?, calib, frames, mirror };
@@ -405,21 +387,7 @@ impl Command {
                 console.print(&if common.json { json::ablation(&rows).to_string() } else { terminal::ablation(&rows) });
                 Ok(0)
             }
-            Self::Attention { model, checkpoint, import, frames, backend, record, attention: args, report, common } => {
-                let (import, backend) = (import.options()?, backend.choose(&common)?);
-                let (block, rows, top) = (args.block.clone(), args.rows(), args.top);
-                let options =
-                    attention::Options { model, checkpoint, record, import, frames, backend, block, rows, top };
-                let measured = attention::attention(&options, progress)?;
-                if let Some(folder) = &report {
-                    report::write_attention(folder, &measured)?;
-                }
-                let report = measured.report;
-                warn_of_calibration(&report.calibration_frames, report.frames.len(), console);
-                let text = || terminal::attention(&report);
-                console.print(&if common.json { json::attention(&report).to_string() } else { text() });
-                Ok(0)
-            }
+            Self::Attention { attention, common } => attention.execute(&common, console, progress),
             Self::Score { logs, common } => {
                 let score = metrics::score(&logs)?;
                 console.print(&if common.json { json::score(&score).to_string() } else { terminal::score(&score) });
@@ -534,8 +502,8 @@ fn warn_of_calibration(known: &[String], frames: usize, console: &mut Console<'_
     }
 }
 
-fn conclude(report: &VerifyReport, json: bool, console: &mut Console<'_>) -> u8 {
-    let Some(failure) = &report.failure else { return 0 };
+fn conclude(failure: Option<&Error>, json: bool, console: &mut Console<'_>) -> u8 {
+    let Some(failure) = failure else { return 0 };
     // The JSON document holds the failure already.
     if !json {
         console.complain(&format!("error: {failure}"));

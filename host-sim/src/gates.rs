@@ -17,6 +17,7 @@
 //!
 //! Every field may be absent. A figure that is not a number misses every gate.
 
+use crate::attention::{AttentionReport, FrameAttention};
 use crate::classification::ClassificationSummary;
 use crate::diff::Diff;
 use crate::report::{StepReport, VerifyReport, worst};
@@ -322,6 +323,22 @@ pub fn loss(diff: &Diff, limit: f64) -> GateOutcome {
     // Without a common step nothing was lost that could be measured.
     let found = worst.map_or(0.0, |step| step.loss_db());
     GateOutcome::at_most("max_loss_db", place, Some(found), limit, "dB")
+}
+
+/// The gate on the strongest keys of attention that integers and f32 have in common.
+///
+/// # Errors
+/// One of the two networks is missing.
+pub fn attention_agreement(report: &AttentionReport, limit: f64) -> Result<GateOutcome> {
+    const GATE: &str = "min_agreement_percent";
+    let agreement = report.agreement.ok_or_else(|| {
+        let error = Error::new(ErrorCode::Usage, format!("gate {GATE}"), "needs the integers and the f32 network");
+        error.with_help("give an image, and --model with the checkpoint that it was compiled from")
+    })?;
+    let keys_percent = |frame: &&FrameAttention| frame.agreement.map_or(0.0, |agreement| agreement.keys_percent);
+    let worst = report.frames.iter().min_by(|a, b| keys_percent(a).total_cmp(&keys_percent(b)));
+    let place = worst.map(|frame| format!("least on frame {}", frame.name));
+    Ok(GateOutcome::at_least(GATE, place, Some(agreement.keys_percent), limit, "%"))
 }
 
 fn lowest(gate: &str, steps: &[StepReport], limit: f64) -> GateOutcome {

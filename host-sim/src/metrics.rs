@@ -100,7 +100,10 @@ impl Score {
 }
 
 impl RouteScore {
-    /// Follows the car along a checked log ([`RouteLog::check`]) until the route ends.
+    /// Follows the car along a log until the route ends.
+    ///
+    /// # Panics
+    /// The log holds no state of the car or no waypoint; [`RouteLog::check`] refuses such a log.
     pub fn of(log: &RouteLog) -> Self {
         let mut progress = Progress::new(&log.waypoints);
         let mut rules = ending::Rules::new(progress.length_m());

@@ -70,6 +70,7 @@ pub fn diff_page(diff: &Diff, gates: &[GateOutcome]) -> String {
 pub fn attention_page(report: &AttentionReport, frames: &[Frame]) -> String {
     let body = html! {
         (attention::summary(report))
+        (gates::section(&report.gates))
         (attention::statistics(report))
         (attention::cells(report, frames))
         (attention::frames(report))

@@ -150,7 +150,7 @@ pub fn error(error: &Error) -> Value {
 }
 
 /// The `error` of a report.
-pub(super) fn failure<S: Serializer>(error: &Option<Error>, serializer: S) -> std::result::Result<S::Ok, S::Error> {
+pub(crate) fn failure<S: Serializer>(error: &Option<Error>, serializer: S) -> std::result::Result<S::Ok, S::Error> {
     error.as_ref().map(Failure::from).serialize(serializer)
 }
 

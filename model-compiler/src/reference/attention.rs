@@ -100,6 +100,18 @@ mod tests {
     }
 
     #[test]
+    fn weights_stand_by_query_and_head_and_add_up_to_one() {
+        // Two heads of one channel; logits of query 0 are 0 and ln 3 in head 0, equal in head 1.
+        let keys = [0.0, 1.0, 1.0, 1.0];
+        let queries = [3.0_f32.ln(), 0.0, 0.0, 50.0];
+        let found = attention_weights(2, Shape::tokens(2, 2), &queries, &keys);
+        assert_close(&found, &[0.25, 0.75, 0.5, 0.5, 0.5, 0.5, 0.5, 0.5], 1e-6);
+        let found = attention_weights(1, Shape::tokens(2, 2), &queries, &keys);
+        let first = 1.0 / (1.0 + (3.0_f64.ln() / 2.0_f64.sqrt()).exp());
+        assert_close(&found, &[first, 1.0 - first, 0.5, 0.5], 1e-6);
+    }
+
+    #[test]
     fn huge_scores_do_not_overflow() {
         let found = attention(1, Shape::tokens(2, 1), &[&[1e4, -1e4], &[1e4, -1e4], &[3.0, 5.0]]);
         assert_eq!(found, [3.0, 5.0]);

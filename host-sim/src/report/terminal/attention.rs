@@ -38,5 +38,5 @@ pub fn attention(report: &AttentionReport) -> String {
             let _ = writeln!(text, "ties in {network:<16}{percent:.2} % of rows: the lowest token was taken");
         }
     }
-    text
+    text + &super::gates(&report.gates)
 }
