@@ -33,7 +33,8 @@ fn published_checkpoints_have_the_published_sizes() {
         (System::Aim, 21_470_722, 4.785),
         (System::LateFusion, 32_644_098, 7.102),
         (System::TransFuser, 66_293_634, 11.632),
-        (System::Cilrs, 12_693_331, 2.370),
+        // One branch of six is computed.
+        (System::Cilrs, 12_693_331, 2.369),
     ] {
         let mut graph = import_default(golden::checkpoint(system));
         assert_eq!(graph.system, system.name());

@@ -199,7 +199,8 @@ pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
 ///
 /// Inputs are `rgb`, `bev`, `velocity`, `goal` and `command`, as far as the system has them, in raw units; the output is
-/// `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake) and `predicted_speed` (m/s). Values carry the names of the checkpoint's modules.
+/// `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake) and `predicted_speed` (m/s). Values
+/// carry the names of the checkpoint's modules.
 ///
 /// # Errors
 /// `Unsupported`: no known system, one that is not supported, or sizes that do not fit together. `Tensors`: the list

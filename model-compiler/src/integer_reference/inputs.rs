@@ -7,8 +7,8 @@ use crate::ir::InputKind;
 ///
 /// Raw units: an image holds 0..=255, a BEV histogram counts 0..=5, the velocity is in m/s and the goal in m. Images
 /// become `u8 − 128` and counts stay as they are (both saturate, and a fraction rounds to the nearest integer, ties up,
-/// though none is expected); velocity becomes i16 Q8, the goal i32 Q16, both by `floor(2^k·x + ½)`, saturated. A command
-/// is its number.
+/// though none is expected); velocity becomes i16 Q8, the goal i32 Q16, both by `floor(2^k·x + ½)`, saturated. A
+/// command is its number.
 pub fn encode_input(kind: InputKind, raw: &[f64]) -> Vec<f64> {
     let round = |x: f64| (x + 0.5).floor();
     let code = |&x: &f64| match kind {
