@@ -23,7 +23,7 @@ pub fn sigmoid(args: &SigmoidArgs<'_>, input: Option<Codes<'_>>, output: &mut [i
 #[cfg(test)]
 mod tests {
     extern crate std;
-    use super::super::oracle::{Rng, for_seeds, round};
+    use super::super::oracle::{for_seeds, round};
     use super::*;
     use crate::fixed_point::TANH_TABLE_LEN;
     use crate::program::Requant;
