@@ -35,7 +35,8 @@ fn published_checkpoints_have_the_published_sizes() {
         (System::TransFuser, 66_293_634, 11.632),
         // Of 40,919,554 without image_projection2 and lidar_conv4; of 8.512 G without lidar_conv4.
         (System::GeometricFusion, 39_868_930, 8.495),
-        (System::Cilrs, 12_693_331, 2.370),
+        // One branch of six is computed.
+        (System::Cilrs, 12_693_331, 2.369),
     ] {
         let mut graph = import_default(golden::checkpoint(system));
         assert_eq!(graph.system, system.name());

@@ -314,7 +314,8 @@ pub struct SigmoidArgs<'a> {
     pub tanh_table: &'a [i16],
 }
 
-/// One method per operator; see the module page. Operand layouts are those of [`crate::tensor`].
+/// One method per operator (branches of linear layers run [`Self::linear`]); see the module page. Operand layouts are
+/// those of [`crate::tensor`].
 pub trait Kernels {
     /// The kernels that this backend can read.
     fn supported(&self) -> &'static [KernelId];

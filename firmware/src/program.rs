@@ -553,9 +553,9 @@ pub struct BranchLinear {
     pub scratch: Option<TensorId>,
 }
 
-/// Logistic function of each element: `x = R((q − z)·M, n)` (Q12, not clamped), `y = min(32767, R(2^15 + tanh(x/2), 1))`
-/// (Q15) with tanh from the table: `a = min(|x|, 2^16 − 1)`, `k = a>>7`, `r = a&127`,
-/// `tanh(x/2) = ±R(T[k]·128 + (T[k+1] − T[k])·r, 7)` with the sign of x.
+/// Logistic function of each element: `x = R((q − z)·M, n)` (Q12, not clamped),
+/// `y = min(32767, R(2^15 + tanh(x/2), 1))` (Q15) with tanh from the table: `a = min(|x|, 2^16 − 1)`, `k = a>>7`,
+/// `r = a&127`, `tanh(x/2) = ±R(T[k]·128 + (T[k+1] − T[k])·r, 7)` with the sign of x.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Sigmoid {
     /// i8 or i16.

@@ -138,7 +138,8 @@ pub fn is_percentage(value: f64) -> bool {
 }
 
 const FIELDS: &str = "fields: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm, max_control_error, \
-                      min_agreement_percent, min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, [steps] with \"PATTERN\" = dB";
+                      min_agreement_percent, min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, \
+                      [steps] with \"PATTERN\" = dB";
 
 impl Gates {
     /// Reads a gate file.

@@ -189,7 +189,8 @@ fn add(sums: &mut [f64], others: &[f64]) {
     sums.iter_mut().zip(others).for_each(|(sum, other)| *sum += other);
 }
 
-/// Mean per channel, and per branch behind a command, of the values that quantized activations stand for: what clipping and rounding leave of each mean.
+/// Mean per channel, and per branch behind a command, of the values that quantized activations stand for: what clipping
+/// and rounding leave of each mean.
 /// `rounded` gives the nearest representable value; `None` leaves a value's float mean. `progress` is called after each
 /// frame with the number done and the total.
 ///
@@ -236,7 +237,8 @@ pub fn quantized_means(
     Ok(means)
 }
 
-/// The means of one branch, or, where none is selected, over all of them: `means` per channel or per branch and channel.
+/// The means of one branch, or, where none is selected, over all of them; `means` are per channel or per branch and
+/// channel.
 pub fn branch_means(means: &[f64], channels: usize, branch: Option<usize>) -> Vec<f64> {
     let forms = means.len() / channels;
     match branch {

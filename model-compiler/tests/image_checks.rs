@@ -60,6 +60,11 @@ fn start(bytes: &[u8], kind: SectionKind) -> usize {
     u32_at(bytes, slot(kind) + section::OFFSET.start)
 }
 
+/// First byte behind a section, its padding not counted.
+fn end(bytes: &[u8], kind: SectionKind) -> usize {
+    start(bytes, kind) + u32_at(bytes, slot(kind) + section::LENGTH.start)
+}
+
 fn scratch_record(parts: &mut ImageParts) -> &mut TensorRecord {
     parts.tensors.iter_mut().find(|t| t.element == ElementType::Scratch).expect("the sample has scratch")
 }
@@ -115,8 +120,9 @@ fn section_changes() -> Vec<(Check, Change)> {
         (
             Check::SectionPadding,
             Sealed(|b| {
-                let behind_step_index = start(b, SectionKind::Program) - 1;
-                b[behind_step_index] = 1;
+                let ends = [SectionKind::StepIndex, SectionKind::Program].map(|kind| end(b, kind));
+                let padding = ends.into_iter().find(|end| !end.is_multiple_of(16)).expect("a section with padding");
+                b[padding] = 1;
             }),
         ),
         (

@@ -6,8 +6,8 @@ use crate::error::Result;
 use crate::ir::Node;
 use crate::qmodel::QOp;
 
-/// Factors to Q12 between which a code's step moves. Above, one step is beyond the table; below, the largest code rounds
-/// to 0.
+/// Factors to Q12 between which a code's step moves. Above, one step is beyond the table; below, the largest code
+/// rounds to 0.
 const FACTORS: (f64, f64) = (1.0 / (1u64 << 29) as f64, (1u64 << 17) as f64);
 
 impl Builder<'_> {

@@ -34,8 +34,8 @@ impl Branches {
     }
 }
 
-/// Runs a graph as [`run`], but under every command instead of the given one. `observe` sees every node with its output,
-/// in order: once with branch 0, or, where it depends on the command, once for every branch.
+/// Runs a graph as [`run`], but under every command instead of the given one. `observe` sees every node's output, in
+/// order: once with branch 0, or, where it depends on the command, once for every branch.
 ///
 /// # Errors
 /// See [`run`].

@@ -25,8 +25,8 @@ pub(super) fn section(frames: &[FrameReport]) -> Markup {
     };
     let rows: Vec<_> = given.iter().take(SHOWN).flat_map(row).collect();
     let about = html! {
-        "Steer, throttle and brake as the networks give them, before the agent's post-processing; frames with the largest "
-        "error first."
+        "Steer, throttle and brake as the networks give them, before the agent's post-processing; frames with the "
+        "largest error first."
         @if given.len() > SHOWN { " Shown are " (SHOWN) " of " (given.len()) " frames." }
     };
     let header: Vec<&str> = ["frame", "network"].into_iter().chain(names.iter().map(String::as_str)).collect();

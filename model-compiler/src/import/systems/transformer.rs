@@ -46,29 +46,60 @@ pub(super) fn tokens(tensors: &NamedTensors) -> Option<usize> {
     most_common(positions(tensors).filter_map(|shape| shape.get(1).copied()))
 }
 
-/// The fusion of each scale that has one.
-pub(super) fn take_all(b: &mut Builder<'_>, widths: &[usize; 4], grid: (u16, u16)) -> [Option<Fusion>; 4] {
-    if !is_shared(&b.tensors) {
-        return std::array::from_fn(|s| {
-            let module = prefix(s + 1);
-            let transformer = has(&b.tensors, &module).then(|| Transformer::take(b, &module, widths[s], grid))?;
-            Some(Fusion { scale: s + 1, transformer, projections: None })
+/// Which scales are fused, and by what.
+pub(super) struct Fusions {
+    /// Channels of the maps per scale.
+    widths: [usize; 4],
+    grid: (u16, u16),
+    /// Per scale.
+    is_fused: [bool; 4],
+    /// The transformer of all scales, with its width.
+    shared: Option<(Transformer, usize)>,
+}
+
+impl Fusions {
+    /// A scale without tensors of its own is not fused. The tensors of a shared transformer are taken here.
+    pub(super) fn detect(b: &mut Builder<'_>, widths: [usize; 4], grid: (u16, u16)) -> Self {
+        let is_shared = is_shared(&b.tensors);
+        let modules = |scale: usize| match is_shared {
+            true => projections(scale).into_iter().flatten().collect(),
+            false => vec![prefix(scale)],
+        };
+        let is_fused = std::array::from_fn(|s| modules(s + 1).iter().any(|module| has(&b.tensors, module)));
+        let shared = is_shared.then(|| {
+            let attention = |name: &str| name.contains(".attn.");
+            let width = common_length(&b.tensors, &[&format!("{SHARED}.blocks.")], attention).unwrap_or(widths[3]);
+            (Transformer::take(b, SHARED, width, grid), width)
         });
+        Self { widths, grid, is_fused, shared }
     }
-    let attention = |name: &str| name.contains(".attn.");
-    let width = common_length(&b.tensors, &[&format!("{SHARED}.blocks.")], attention).unwrap_or(widths[3]);
-    let transformer = Transformer::take(b, SHARED, width, grid);
-    std::array::from_fn(|s| {
-        let modules = SIDES.map(|side| ["conv", "deconv"].map(|direction| projection(side, direction, s + 1)));
-        if !modules.iter().flatten().any(|module| has(&b.tensors, module)) {
+
+    /// Whether any scale is fused.
+    pub(super) fn any(&self) -> bool {
+        self.is_fused.contains(&true)
+    }
+
+    /// The fusion of scale 1..=4, with the tensors that are its own.
+    pub(super) fn take(&self, b: &mut Builder<'_>, scale: usize) -> Option<Fusion> {
+        let channels = self.widths[scale - 1];
+        if !self.is_fused[scale - 1] {
             return None;
         }
-        let projections = modules.map(|[conv, deconv]| Projections {
-            to: b.pointwise(&conv, widths[s], width),
-            back: b.pointwise(&deconv, width, widths[s]),
+        let Some((transformer, width)) = &self.shared else {
+            let transformer = Transformer::take(b, &prefix(scale), channels, self.grid);
+            return Some(Fusion { scale, transformer, projections: None });
+        };
+        let projections = projections(scale).map(|[conv, deconv]| Projections {
+            to: b.pointwise(&conv, channels, *width),
+            back: b.pointwise(&deconv, *width, channels),
         });
-        Some(Fusion { scale: s + 1, transformer: transformer.clone(), projections: Some(projections) })
-    })
+        Some(Fusion { scale, transformer: transformer.clone(), projections: Some(projections) })
+    }
+}
+
+/// Modules of the 1×1 convolutions in front of and behind a shared transformer, of both maps.
+fn projections(scale: usize) -> [[String; 2]; 2] {
+    SIDES.map(|side| ["conv", "deconv"].map(|direction| projection(side, direction, scale)))
 }
 
 /// The two maps, in the order of their tokens.
@@ -95,8 +126,8 @@ struct Block {
 }
 
 impl Transformer {
-    /// Takes the tensors of a module. Embeddings belong to all scales or to none (the ablation without them; where it kept
-    /// its unused zeros in the checkpoint, adding them changes nothing).
+    /// Takes the tensors of a module. Embeddings belong to all scales or to none (the ablation without them; where it
+    /// kept its unused zeros in the checkpoint, adding them changes nothing).
     fn take(b: &mut Builder<'_>, module: &str, channels: usize, grid: (u16, u16)) -> Self {
         let name = |leaf: &str| format!("{module}.{leaf}");
         let blocks = name("blocks.");

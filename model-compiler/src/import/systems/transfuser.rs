@@ -2,7 +2,8 @@
 
 use super::builder::Builder;
 use super::resnet::{self, ResNet, TOTAL_STRIDE};
-use super::{DEFAULT_RESOLUTION, has, head, transformer};
+use super::transformer::{self, Fusions};
+use super::{DEFAULT_RESOLUTION, has, head};
 use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::{InputKind, Op, Shape};
@@ -21,20 +22,17 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
     let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);
-    let scales = transformer::take_all(b, &image_network.widths, grid);
+    let fusions = Fusions::detect(b, image_network.widths, grid);
 
     let rgb = b.rgb("encoder.image_encoder", resolution)?;
     let bev = b.bev(resolution, channels);
-    let velocity = scales
-        .iter()
-        .any(Option::is_some)
-        .then(|| b.graph.push_input("velocity", InputKind::Velocity, Shape::vector(1)));
+    let velocity = fusions.any().then(|| b.graph.push_input("velocity", InputKind::Velocity, Shape::vector(1)));
     let mut image = image_network.stem(b, rgb, 3)?;
     let mut lidar = lidar_network.stem(b, bev, channels)?;
-    for (stage, scale) in (1..=4).zip(&scales) {
+    for stage in 1..=4 {
         image = image_network.stage(b, stage, image)?;
         lidar = lidar_network.stage(b, stage, lidar)?;
-        if let (Some(fusion), Some(velocity)) = (scale, velocity) {
+        if let (Some(fusion), Some(velocity)) = (fusions.take(b, stage), velocity) {
             (image, lidar) = fusion.fuse(b, image, lidar, velocity)?;
         }
     }
