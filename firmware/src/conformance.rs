@@ -82,7 +82,7 @@ struct Difference {
 }
 
 /// Every operator of the image format.
-const OPERATORS: [Operator; 15] = [
+const OPERATORS: [Operator; 16] = [
     Operator { name: "conv2d", cases: 3000, run: weighted::conv2d },
     Operator { name: "linear", cases: 3000, run: weighted::linear },
     Operator { name: "max_pool", cases: 1000, run: maps::max_pool },
@@ -98,6 +98,7 @@ const OPERATORS: [Operator; 15] = [
     Operator { name: "copy_box", cases: 600, run: maps::copy_box },
     Operator { name: "concat", cases: 600, run: maps::concat },
     Operator { name: "softmax", cases: 600, run: tokens::softmax },
+    Operator { name: "spatial_softmax", cases: 300, run: tokens::spatial_softmax },
 ];
 
 /// Compares a backend with [`Portable`]. `workspace`: [`WORKSPACE_BYTES`]; what does not fit in a smaller one is left out

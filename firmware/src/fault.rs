@@ -42,7 +42,7 @@ pub enum Fault {
     MultiplierPlusOne,
     /// The weights of output channels 0 and 1 are swapped.
     ChannelsSwapped,
-    /// The softmax maximum skips the last key (of attention) or channel.
+    /// The softmax maximum skips the last key (of attention), channel or pixel.
     SoftmaxMaximum,
     /// Resize uses the weights of its two rows the wrong way round.
     ResizeWeights,
@@ -60,11 +60,13 @@ pub enum Fault {
     BorderZero,
     /// The operands of a concatenation are exchanged.
     ConcatOrder,
+    /// Column and row of a spatial softmax's points are exchanged.
+    PointAxes,
 }
 
 impl Fault {
     /// All faults, for tests and `--fault NAME`.
-    pub const ALL: [Fault; 26] = [
+    pub const ALL: [Fault; 27] = [
         Self::TieDown,
         Self::TieAwayFromZero,
         Self::DoubleRounding,
@@ -91,6 +93,7 @@ impl Fault {
         Self::BoxOffset,
         Self::BorderZero,
         Self::ConcatOrder,
+        Self::PointAxes,
     ];
 }
 

@@ -290,6 +290,17 @@ pub struct SoftmaxArgs<'a> {
     pub exp_table: &'a [i16],
 }
 
+/// Arguments of [`Kernels::spatial_softmax`].
+#[derive(Clone, Copy, Debug)]
+pub struct SpatialSoftmaxArgs<'a> {
+    /// Shape of the logits.
+    pub shape: Shape,
+    /// `M_u`, `n_u`.
+    pub exponent: Requant,
+    /// 257 entries.
+    pub exp_table: &'a [i16],
+}
+
 /// One method per operator; see the module page. Operand layouts are those of [`crate::tensor`].
 pub trait Kernels {
     /// The kernels that this backend can read.
@@ -386,6 +397,11 @@ pub trait Kernels {
     fn softmax(&self, args: &SoftmaxArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
         portable::softmax::softmax(args, input, output);
     }
+
+    /// Expected pixel per channel. `points`: `[column, row]` of each channel, in 1/64 pixel.
+    fn spatial_softmax(&self, args: &SpatialSoftmaxArgs<'_>, input: &[i16], points: &mut [i32]) {
+        portable::spatial_softmax::spatial_softmax(args, input, points);
+    }
 }
 
 /// A borrowed backend is one: every method goes to the backend behind the reference.
@@ -467,6 +483,10 @@ impl<K: Kernels + ?Sized> Kernels for &K {
 
     fn softmax(&self, args: &SoftmaxArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
         (**self).softmax(args, input, output);
+    }
+
+    fn spatial_softmax(&self, args: &SpatialSoftmaxArgs<'_>, input: &[i16], points: &mut [i32]) {
+        (**self).spatial_softmax(args, input, points);
     }
 }
 

@@ -38,6 +38,7 @@ mod requantize;
 mod rescale;
 mod resize_bilinear;
 mod softmax;
+mod spatial_softmax;
 mod term;
 mod tokens;
 mod waypoint_decoder;
@@ -63,6 +64,7 @@ pub(crate) fn validate(step: &Step, context: &StepContext<'_, '_>) -> Result<u64
         Step::CopyBox(step) => copy_box::validate(step, context),
         Step::Concat(step) => concat::validate(step, context),
         Step::Softmax(step) => softmax::validate(step, context),
+        Step::SpatialSoftmax(step) => spatial_softmax::validate(step, context),
     }
 }
 
@@ -94,6 +96,7 @@ pub(crate) fn run<K: Kernels>(
         Step::CopyBox(step) => copy_box::run(step, &context, kernels, operands),
         Step::Concat(step) => concat::run(step, &context, kernels, operands),
         Step::Softmax(step) => softmax::run(step, &context, kernels, operands),
+        Step::SpatialSoftmax(step) => spatial_softmax::run(step, &context, kernels, operands),
     }
 }
 

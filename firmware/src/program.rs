@@ -505,6 +505,25 @@ pub struct Softmax {
     pub exp_table: ConstRange,
 }
 
+/// Expected pixel of each channel's map under a softmax over all pixels: for channel k, with `δ_j = max(q_k) − q_jk`,
+/// `u_j = min(R(δ_j·M_u, n_u), 31·2^16)`, `I = u>>16`, `i = (u>>8)&255`, `r = u&255`:
+///
+/// `e_j = R((T[i]<<8) − (T[i]−T[i+1])·r, I)` (Q23); `column = floor(2^6·Σ e_j·column_j / Σ e_j)`, `row` alike.
+///
+/// No probability is formed: Q15 is too coarse where thousands of faint pixels outweigh the peak. At most 256 rows and
+/// columns: then `Σ e_j < 2^39` and `2^6·Σ e_j·column_j < 2^53`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SpatialSoftmax {
+    /// i16 map of logits `H×W×K`, H and W at most 256.
+    pub input: TensorId,
+    /// i32 points `K×1×2`, `[column, row]` in 1/64 pixel from the center of the first pixel.
+    pub output: TensorId,
+    /// `M_u`, `n_u`, of `s_x·log2(e)/temperature·2^16`.
+    pub exponent: Requant,
+    /// 257 × `i16`: `T[k] = min(32767, round(2^15·2^(−k/256)))`.
+    pub exp_table: ConstRange,
+}
+
 /// One operator of the program, in the order of execution.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant, reason = "decoded one at a time on the stack, never stored in bulk on the target")]
@@ -525,6 +544,7 @@ pub enum Step {
     CopyBox(CopyBox),
     Concat(Concat),
     Softmax(Softmax),
+    SpatialSoftmax(SpatialSoftmax),
 }
 
 impl Rescale {
@@ -539,7 +559,8 @@ impl Rescale {
 
 impl Step {
     /// Union of the feature bits of all step kinds and kernels of this format.
-    pub const KNOWN_FEATURES: u64 = ((1 << 15) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
+    pub const KNOWN_FEATURES: u64 =
+        ((1 << 15) - 1) | (1 << 18) | KernelId::Direct.feature() | KernelId::K4N16.feature();
 
     /// Operator name as reports print it.
     pub const fn name(&self) -> &'static str {
@@ -559,6 +580,7 @@ impl Step {
             Self::CopyBox(_) => "copy_box",
             Self::Concat(_) => "concat",
             Self::Softmax(_) => "softmax",
+            Self::SpatialSoftmax(_) => "spatial_softmax",
         }
     }
 
@@ -580,6 +602,7 @@ impl Step {
             Self::CopyBox(_) => 12,
             Self::Concat(_) => 13,
             Self::Softmax(_) => 14,
+            Self::SpatialSoftmax(_) => 18,
         }
     }
 
@@ -601,6 +624,7 @@ impl Step {
             Self::CopyBox(s) => s.output,
             Self::Concat(s) => s.output,
             Self::Softmax(s) => s.output,
+            Self::SpatialSoftmax(s) => s.output,
         }
     }
 
@@ -642,6 +666,7 @@ impl Step {
             Self::CopyBox(s) => [Some(s.input), None, None],
             Self::Concat(s) => [Some(s.first.tensor), Some(s.second.tensor), None],
             Self::Softmax(s) => [Some(s.input), None, None],
+            Self::SpatialSoftmax(s) => [Some(s.input), None, None],
         }
     }
 

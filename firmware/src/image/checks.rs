@@ -119,6 +119,7 @@ checks! {
     StepFraction: "the fraction bits of the hidden state are out of range",
     StepBox: "the box leaves the input or the output",
     StepBorder: "the code of the border is outside the element type",
+    StepPixels: "more rows or columns than the operator can sum exactly",
     Work: "the program would run too long",
 }
 

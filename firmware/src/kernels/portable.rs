@@ -18,6 +18,7 @@ pub mod pool;
 mod product;
 pub mod resize_bilinear;
 pub mod softmax;
+pub mod spatial_softmax;
 pub mod tokens;
 pub mod waypoint_decoder;
 mod windows;
