@@ -139,6 +139,12 @@ pub struct ImportArgs {
     /// Factor of the grey levels before --mean and --std: a number or a fraction [default: 1/255].
     #[arg(long, value_parser = fraction, requires = "mean")]
     scale: Option<f64>,
+    /// Checkpoint of lbc: the network was trained on views of half the size (its hyper-parameter of this name).
+    #[arg(long)]
+    hack: bool,
+    /// Checkpoint of lbc: what divides the logits before the spatial softmax [default: 5].
+    #[arg(long, value_parser = positive)]
+    temperature: Option<f64>,
 }
 
 /// `HEIGHTxWIDTH`.
@@ -211,7 +217,14 @@ impl ImportArgs {
         let system = self.system.as_deref().map(str::parse).transpose();
         let system = system.map_err(|e: Error| e.within("--system"))?;
         let resolution = self.resolution.map(|Resolution(h, w)| (h, w));
-        Ok(ImportOptions { system, heads: self.heads, resolution, normalization: self.normalization() })
+        Ok(ImportOptions {
+            system,
+            heads: self.heads,
+            resolution,
+            normalization: self.normalization(),
+            hack: self.hack,
+            temperature: self.temperature.map(|t| t as f32),
+        })
     }
 
     /// `(x·scale − mean)/std` in grey levels.

@@ -2,7 +2,7 @@
 //!
 //! Three sources give the same [`Frame`]:
 //! * a **frame directory** `FRAMES/<name>/{rgb.png, lidar.bin, frame.json}`: sensor data, prepared here ([`camera`],
-//!   [`bev`]) by the rules that the networks were trained with
+//!   [`bev`], [`views`]) by the rules that the networks were trained with
 //! * an **image directory**, for classifiers: PNG or JPEG files and, optionally, their labels ([`images`])
 //! * a **tensor file** (`.safetensors`) of ready network inputs, first dimension = frames
 //!
@@ -21,6 +21,7 @@ mod directory;
 pub mod images;
 pub mod labels;
 mod tensors;
+pub mod views;
 
 pub use labels::Label;
 
@@ -41,6 +42,8 @@ pub struct FrameFormat {
     pub velocity: bool,
     /// Goal point.
     pub goal: bool,
+    /// Three camera views and the heatmap of the target, `H×W×10`.
+    pub views: Option<Shape>,
     /// Height that separates the two histogram channels: meters, relative to a sensor 2.5 m above ground.
     pub split_height_m: f64,
 }
@@ -56,6 +59,7 @@ impl FrameFormat {
             bev: None,
             velocity: false,
             goal: false,
+            views: None,
             split_height_m: split_height_m(system),
         };
         for (kind, shape) in inputs {
@@ -64,6 +68,7 @@ impl FrameFormat {
                 InputKind::Bev => format.bev = Some(shape),
                 InputKind::Velocity => format.velocity = true,
                 InputKind::Goal => format.goal = true,
+                InputKind::Views => format.views = Some(shape),
             }
         }
         format
@@ -72,7 +77,8 @@ impl FrameFormat {
     /// The same, of a classifier if there is nothing but one image to read and the first output is a vector.
     #[must_use]
     pub fn with_output(mut self, image_name: &str, output: Option<Shape>) -> Self {
-        let reads_only_an_image = self.image.is_some() && self.bev.is_none() && !self.velocity && !self.goal;
+        let reads_only_an_image =
+            self.image.is_some() && self.bev.is_none() && !self.velocity && !self.goal && self.views.is_none();
         self.classes = output.filter(|s| reads_only_an_image && (s.height, s.width) == (1, 1)).map(|s| s.channels);
         if self.classes.is_some() {
             self.image_name = image_name.into();
@@ -113,6 +119,15 @@ pub struct ByteMap {
     pub data: Vec<u8>,
 }
 
+/// A map of real values, channel fastest.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RealMap {
+    /// Height, width, channels.
+    pub shape: Shape,
+    /// `height·width·channels` values.
+    pub data: Vec<f32>,
+}
+
 /// One moment of driving, or one image to classify.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Frame {
@@ -126,6 +141,8 @@ pub struct Frame {
     pub velocity: Option<f64>,
     /// Goal `[right, forward-negative]`, m.
     pub goal: Option<[f64; 2]>,
+    /// Views front, left, right (three channels each) and the heatmap of the target, `H×W×10` in grey levels 0..=255.
+    pub views: Option<RealMap>,
     /// Navigation command 1..=6; no network input here.
     pub command: Option<u8>,
     /// LiDAR points with a coordinate that is not finite; they are left out.
@@ -135,7 +152,7 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The values of one network input in raw units: grey levels, counts, m/s, m.
+    /// The values of one network input in raw units: grey levels (of views not always whole ones), counts, m/s, m.
     ///
     /// # Errors
     /// The frame does not hold this input.
@@ -146,6 +163,7 @@ impl Frame {
             InputKind::Bev => self.bev.as_ref().map(bytes),
             InputKind::Velocity => self.velocity.map(|v| vec![v as f32]),
             InputKind::Goal => self.goal.map(|g| g.map(|v| v as f32).to_vec()),
+            InputKind::Views => self.views.as_ref().map(|views| views.data.clone()),
         };
         values.ok_or_else(|| {
             Error::new(
@@ -164,6 +182,7 @@ impl Frame {
             rgb: self.rgb.as_ref().map(flip_columns),
             bev: self.bev.as_ref().map(flip_rows),
             goal: self.goal.map(|[right, y]| [0.0 - right, y]),
+            views: self.views.as_ref().map(views::mirrored),
             command: self.command.map(mirrored_command),
             ..self.clone()
         }
@@ -172,7 +191,7 @@ impl Frame {
     /// SHA-256 over everything that a network reads of this frame. The name does not count.
     pub fn digest(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
-        for kind in [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal] {
+        for kind in [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal, InputKind::Views] {
             if let Ok(values) = self.raw(kind) {
                 hash.update(input_name(kind));
                 values.iter().for_each(|v| hash.update(v.to_le_bytes()));
@@ -194,6 +213,7 @@ pub fn input_name(kind: InputKind) -> &'static str {
         InputKind::Bev => "bev",
         InputKind::Velocity => "velocity",
         InputKind::Goal => "goal",
+        InputKind::Views => "views",
     }
 }
 

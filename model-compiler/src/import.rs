@@ -122,7 +122,7 @@ pub enum System {
     GeometricFusion,
     /// Conditional imitation learning; recognized, not supported.
     Cilrs,
-    /// Learning by cheating; recognized, not supported.
+    /// Learning by cheating: three views and a heatmap of the target (DeepLabV3 on ResNet-50), points in the image.
     Lbc,
 }
 
@@ -174,6 +174,10 @@ pub struct ImportOptions {
     /// ONNX: mean and deviation of the image in grey levels 0..=255, one value for all channels or one for each. When
     /// absent: ImageNet's for three channels, 0 and 255 (so 0..1) for one.
     pub normalization: Option<Normalization>,
+    /// LBC: halve the views before the network and double its maps behind it.
+    pub hack: bool,
+    /// LBC: what divides the logits before the spatial softmax, positive; 5 when absent.
+    pub temperature: Option<f32>,
 }
 
 /// Builds the float graph of a file, a checkpoint or an ONNX model, told by its content.
@@ -198,8 +202,8 @@ pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
 
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
 ///
-/// Inputs are `rgb`, `bev`, `velocity` and `goal`, as far as the system has them, in raw units; the output is
-/// `waypoints`. Values carry the names of the checkpoint's modules.
+/// Inputs are `rgb`, `bev`, `velocity`, `goal` and `views`, as far as the system has them, in raw units; the output is
+/// `waypoints` or `points`. Values carry the names of the checkpoint's modules.
 ///
 /// # Errors
 /// `Unsupported`: no known system, one that is not supported, or sizes that do not fit together. `Tensors`: the list
@@ -218,7 +222,7 @@ fn unrecognized(tensors: &NamedTensors) -> Error {
         format!("the tensor names are of no known system ({} tensors: {}, …)", tensors.len(), first.join(", "))
     };
     Error::new(ErrorCode::Unsupported, "", message)
-        .with_help("supported are checkpoints of aim, late_fusion and transfuser (2021); --system names one")
+        .with_help("supported are checkpoints of aim, late_fusion, transfuser (2021) and lbc; --system names one")
 }
 
 #[cfg(test)]
@@ -245,6 +249,7 @@ mod tests {
             ),
             (System::Cilrs, names(&["encoder.features.conv1.weight", "controller.vel_in.0.weight"])),
             (System::Lbc, names(&["net.network.backbone.conv1.weight"])),
+            (System::Lbc, names(&["model.net.network.backbone.conv1.weight", "model.teacher.net.norm.bias"])),
         ] {
             assert_eq!(System::detect(&tensors), Some(system));
             assert_eq!(system.name().parse::<System>().unwrap(), system);
@@ -254,7 +259,7 @@ mod tests {
 
     #[test]
     fn systems_that_come_later_are_refused_by_name() {
-        for system in [System::GeometricFusion, System::Cilrs, System::Lbc] {
+        for system in [System::GeometricFusion, System::Cilrs] {
             let options = ImportOptions { system: Some(system), ..Default::default() };
             let error = import("file.pth", names(&["x"]), &options).unwrap_err();
             assert_eq!(error.code, ErrorCode::Unsupported);
@@ -269,7 +274,7 @@ mod tests {
         assert_eq!(
             error.to_string(),
             "m.pth: the tensor names are of no known system (2 tensors: fc.bias, fc.weight, …)\n  \
-             help: supported are checkpoints of aim, late_fusion and transfuser (2021); --system names one"
+             help: supported are checkpoints of aim, late_fusion, transfuser (2021) and lbc; --system names one"
         );
     }
 

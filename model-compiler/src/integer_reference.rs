@@ -23,6 +23,7 @@ mod pool;
 mod rescale;
 mod resize_bilinear;
 mod softmax;
+mod spatial_softmax;
 mod sum;
 #[cfg(test)]
 mod testing;
@@ -166,6 +167,10 @@ fn dispatch(operands: &Operands, op: &QOp) -> Result<Vec<f64>> {
         }
         QOp::Softmax { input, output, exponent, exp_table } => {
             softmax::softmax(operands, *input, *output, &softmax::Exponential::new(*exponent, exp_table)?)
+        }
+        QOp::SpatialSoftmax { input, output, exponent, exp_table } => {
+            let exponential = softmax::Exponential::new(*exponent, exp_table)?;
+            spatial_softmax::spatial_softmax(operands, *input, *output, &exponential)
         }
     }
 }

@@ -52,6 +52,9 @@ pub enum InputKind {
     Velocity,
     /// Goal point `[right, forward-negative]`, m.
     Goal,
+    /// Three RGB views (front, left, right) and the heatmap of the target, in grey levels 0..=255; the heatmap's are no
+    /// whole numbers.
+    Views,
 }
 
 /// Bounds of a result: `min(max(x, min), max)`. ReLU is `0..∞`, ReLU6 `0..6`.
@@ -248,6 +251,12 @@ pub enum Op {
     Concat(Axis),
     /// `[x]`: `exp(x) / Σ exp(x)` over the channels of each position.
     Softmax,
+    /// `[map]`: per channel the expected `[column, row]` under `exp(x / temperature) / Σ exp(x / temperature)` over all
+    /// pixels, in pixels from the center of the first; `channels × 1 × 2`.
+    SpatialSoftmax {
+        /// Divides the logits; positive.
+        temperature: f32,
+    },
 }
 
 /// One operator application.
@@ -355,6 +364,7 @@ impl Op {
             Self::Pad(_) => "pad",
             Self::Concat(_) => "concat",
             Self::Softmax => "softmax",
+            Self::SpatialSoftmax { .. } => "spatial_softmax",
         }
     }
 

@@ -13,8 +13,8 @@ use firmware::image::TensorRecord;
 use firmware::kernels::{k4n16, plan};
 use firmware::program::{
     Add, Attention, AveragePool, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GlobalPool, KernelId, LayerNorm,
-    Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, Step, Term, TokenSource, Tokens,
-    WaypointDecoder,
+    Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Softmax, SpatialSoftmax, Step, Term, TokenSource,
+    Tokens, WaypointDecoder,
 };
 use firmware::tensor::TensorId;
 
@@ -290,6 +290,12 @@ impl Packer {
                 clamp: *clamp,
             }),
             QOp::Softmax { input, output, exponent, exp_table } => Step::Softmax(Softmax {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                exponent: *exponent,
+                exp_table: self.constants.push(exp_table)?,
+            }),
+            QOp::SpatialSoftmax { input, output, exponent, exp_table } => Step::SpatialSoftmax(SpatialSoftmax {
                 input: tensor_id(*input)?,
                 output: tensor_id(*output)?,
                 exponent: *exponent,

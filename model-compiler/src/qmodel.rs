@@ -306,6 +306,13 @@ pub enum QOp {
         /// 257 entries.
         exp_table: Vec<i16>,
     },
+    SpatialSoftmax {
+        input: QTensorId,
+        output: QTensorId,
+        exponent: Requant,
+        /// 257 entries.
+        exp_table: Vec<i16>,
+    },
 }
 
 impl QModel {
@@ -334,12 +341,20 @@ impl QOp {
             Self::CopyBox { .. } => "copy_box",
             Self::Concat { .. } => "concat",
             Self::Softmax { .. } => "softmax",
+            Self::SpatialSoftmax { .. } => "spatial_softmax",
         }
     }
 
     /// Whether the operator bounds its output codes; the others copy codes or give fixed point.
     pub fn has_clamp(&self) -> bool {
-        !matches!(self, Self::MaxPool { .. } | Self::CopyBox { .. } | Self::Softmax { .. } | Self::WaypointDecoder(_))
+        !matches!(
+            self,
+            Self::MaxPool { .. }
+                | Self::CopyBox { .. }
+                | Self::Softmax { .. }
+                | Self::SpatialSoftmax { .. }
+                | Self::WaypointDecoder(_)
+        )
     }
 
     /// Bounds of the output code.
@@ -355,7 +370,11 @@ impl QOp {
             | Self::LayerNorm { clamp, .. }
             | Self::Attention { clamp, .. }
             | Self::Concat { clamp, .. } => Some(clamp),
-            Self::MaxPool { .. } | Self::CopyBox { .. } | Self::Softmax { .. } | Self::WaypointDecoder(_) => None,
+            Self::MaxPool { .. }
+            | Self::CopyBox { .. }
+            | Self::Softmax { .. }
+            | Self::SpatialSoftmax { .. }
+            | Self::WaypointDecoder(_) => None,
         }
     }
 
@@ -387,7 +406,8 @@ impl QOp {
             | Self::Requantize { input, .. }
             | Self::LayerNorm { input, .. }
             | Self::CopyBox { input, .. }
-            | Self::Softmax { input, .. } => vec![*input],
+            | Self::Softmax { input, .. }
+            | Self::SpatialSoftmax { input, .. } => vec![*input],
             Self::GlobalPool { first, second, .. } => {
                 std::iter::once(first.tensor).chain(second.map(|t| t.tensor)).collect()
             }
@@ -418,7 +438,8 @@ impl QOp {
             | Self::Attention { output, .. }
             | Self::CopyBox { output, .. }
             | Self::Concat { output, .. }
-            | Self::Softmax { output, .. } => *output,
+            | Self::Softmax { output, .. }
+            | Self::SpatialSoftmax { output, .. } => *output,
             Self::WaypointDecoder(d) => d.output,
         }
     }

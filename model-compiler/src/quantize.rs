@@ -24,6 +24,7 @@ mod moves;
 pub mod ranges;
 mod rounding;
 mod softmax;
+mod spatial_softmax;
 mod sums;
 pub mod tables;
 #[cfg(test)]
@@ -235,6 +236,7 @@ impl Builder<'_> {
             Op::Concat(axis) => self.concat(node, *axis),
             Op::Clip(clip) => self.clip(node, *clip),
             Op::Softmax => self.softmax(node),
+            Op::SpatialSoftmax { temperature } => self.spatial_softmax(node, *temperature),
             Op::Normalize(_) | Op::BatchNorm(_) => Err(Error::new(
                 ErrorCode::Unsupported,
                 "",

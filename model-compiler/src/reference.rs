@@ -18,6 +18,7 @@ mod pool;
 mod rerun;
 mod resize_bilinear;
 mod slice;
+mod spatial_softmax;
 mod tokens;
 mod waypoint_decoder;
 
@@ -44,7 +45,7 @@ impl Activations {
 
 /// Runs a graph and returns its outputs; a value is dropped after its last use.
 ///
-/// `inputs` are raw, in the order of [`Graph::inputs`]: image 0..=255 and BEV counts 0..=5, both
+/// `inputs` are raw, in the order of [`Graph::inputs`]: image and views 0..=255 and BEV counts 0..=5, all
 /// `height × width × channels`; velocity `[m/s]`; goal `[right, forward-negative]` in m. `observe` sees every node with
 /// its output, in order (for a BEV input that is counts / 5).
 ///
@@ -123,6 +124,9 @@ pub fn evaluate(op: &Op, input_shapes: &[Shape], inputs: &[&[f32]], output_shape
         Op::Pad(pad) => slice::pad(pad, input_shapes[0], inputs[0], output_shape),
         Op::Concat(axis) => slice::concat(*axis, input_shapes, inputs),
         Op::Softmax => elementwise::softmax(inputs[0], usize::from(output_shape.channels)),
+        Op::SpatialSoftmax { temperature } => {
+            spatial_softmax::spatial_softmax(*temperature, input_shapes[0], inputs[0])
+        }
     }
 }
 

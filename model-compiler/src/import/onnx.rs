@@ -52,7 +52,12 @@ pub fn is_onnx(bytes: &[u8]) -> bool {
 /// `Unsupported` for what is not translated, `Malformed` for what contradicts ONNX, `Tensors` for weights that are not
 /// finite, `Usage` for options that do not fit.
 pub fn import(model: &Model, folder: Option<&Path>, options: &ImportOptions) -> Result<Graph> {
-    for (option, is_given) in [("--system", options.system.is_some()), ("--heads", options.heads.is_some())] {
+    for (option, is_given) in [
+        ("--system", options.system.is_some()),
+        ("--heads", options.heads.is_some()),
+        ("--hack", options.hack),
+        ("--temperature", options.temperature.is_some()),
+    ] {
         if is_given {
             return Err(Error::new(ErrorCode::Usage, "", format!("{option} has no effect on an ONNX file"))
                 .with_help(format!("leave {option} out")));

@@ -9,10 +9,13 @@ use crate::ir::Graph;
 use builder::Builder;
 
 mod aim;
+mod bottleneck;
 mod builder;
+mod deeplab;
 mod detect;
 mod head;
 mod late_fusion;
+mod lbc;
 mod resnet;
 mod transformer;
 mod transfuser;
@@ -31,7 +34,7 @@ fn has(tensors: &NamedTensors, prefix: &str) -> bool {
 /// The system of these names. The order matters: some systems' names include those of a simpler one.
 pub(super) fn detect(tensors: &NamedTensors) -> Option<System> {
     let recognized: [(System, bool); 6] = [
-        (System::Lbc, has(tensors, "net.network.backbone.")),
+        (System::Lbc, lbc::recognize(tensors)),
         (System::Cilrs, has(tensors, "encoder.features.") && has(tensors, "controller.")),
         (System::GeometricFusion, has(tensors, "encoder.image_conv") || has(tensors, "encoder.image_projection")),
         (System::TransFuser, transfuser::recognize(tensors)),
@@ -47,12 +50,17 @@ pub(super) fn build(system: System, name: &str, tensors: NamedTensors, options: 
         System::Aim => aim::build,
         System::LateFusion => late_fusion::build,
         System::TransFuser => transfuser::build,
-        System::GeometricFusion | System::Cilrs | System::Lbc => {
+        System::Lbc => lbc::build,
+        System::GeometricFusion | System::Cilrs => {
             let message = format!("this is a checkpoint of {}, which is not supported", system.name());
             return Err(Error::new(ErrorCode::Unsupported, "", message)
-                .with_help("supported are aim, late_fusion and transfuser"));
+                .with_help("supported are aim, late_fusion, transfuser and lbc"));
         }
     };
+    if system != System::Lbc && (options.hack || options.temperature.is_some()) {
+        let message = format!("--hack and --temperature have no effect on {}", system.name());
+        return Err(Error::new(ErrorCode::Usage, "", message).with_help("leave them out; they belong to lbc"));
+    }
     let mut builder = Builder::new(name, system, tensors, options);
     let built = recipe(&mut builder);
     builder.finish(built)

@@ -80,7 +80,8 @@ impl Op {
             | Self::Slice(_)
             | Self::Pad(_)
             | Self::Concat(_)
-            | Self::Softmax => Vec::new(),
+            | Self::Softmax
+            | Self::SpatialSoftmax { .. } => Vec::new(),
         }
     }
 }

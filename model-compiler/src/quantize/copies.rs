@@ -51,7 +51,7 @@ pub(super) fn share_storage(graph: &Graph, roles: &[Role], types: &mut [Stored])
 
 /// Whether the step of an operator bounds its output.
 fn has_bounds(op: &Op) -> bool {
-    !is_copy(op) && !matches!(op, Op::Input(_) | Op::Softmax | Op::WaypointDecoder(_))
+    !is_copy(op) && !matches!(op, Op::Input(_) | Op::Softmax | Op::SpatialSoftmax { .. } | Op::WaypointDecoder(_))
 }
 
 /// The values whose storage must also hold the border of a pad behind them, each with the padded value.

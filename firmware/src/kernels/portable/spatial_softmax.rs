@@ -99,8 +99,7 @@ mod tests {
     #[test]
     fn equals_the_formula() {
         for_seeds(300, |rng| {
-            let shape =
-                Shape::map(rng.range(1, 12) as u16, rng.range(1, 12) as u16, rng.range(1, 6) as u16);
+            let shape = Shape::map(rng.range(1, 12) as u16, rng.range(1, 12) as u16, rng.range(1, 6) as u16);
             check(rng, shape);
         });
     }

@@ -2,6 +2,7 @@
 
 use super::weights::{Problems, oihw_to_ohwi};
 use crate::error::{Error, ErrorCode, Result};
+use crate::frames::views::LEVELS;
 use crate::import::{ImportOptions, NamedTensors, System};
 use crate::ir::{
     BatchNorm, Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Shape, ValueId, Weights,
@@ -99,6 +100,36 @@ impl<'a> Builder<'a> {
             epsilon: EPSILON,
         };
         self.push(norm, Op::BatchNorm(op), &[map])
+    }
+
+    /// Batch norm that was trained on values 0..=1, over grey levels 0..=255: all its statistics are times 255.
+    pub(super) fn grey_norm(&mut self, module: &str, input: ValueId) -> Result<ValueId> {
+        let channels = [usize::from(self.graph.value(input).shape.channels)];
+        let mut vector = |leaf: &str| self.vector(&format!("{module}.{leaf}"), &channels);
+        let scaled = |values: Arc<Vec<f32>>, factor: f32| Arc::new(values.iter().map(|v| v * factor).collect());
+        let op = BatchNorm {
+            weight: vector("weight"),
+            bias: vector("bias"),
+            mean: scaled(vector("running_mean"), LEVELS),
+            variance: scaled(vector("running_var"), LEVELS * LEVELS),
+            epsilon: EPSILON * LEVELS * LEVELS,
+        };
+        self.push(module, Op::BatchNorm(op), &[input])
+    }
+
+    /// Convolution of one pixel, with bias.
+    pub(super) fn conv_1x1(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
+        let shape = [outputs, usize::from(self.graph.value(input).shape.channels), 1, 1];
+        let values = self.problems.take(&mut self.tensors, &format!("{module}.weight"), &shape);
+        let op = Conv2d {
+            weights: oihw_to_ohwi(&values, shape),
+            bias: Some(self.vector(&format!("{module}.bias"), &shape[..1])),
+            window: Window::square(1, 1, 0),
+            groups: 1,
+            normalization: None,
+            clip: Clip::NONE,
+        };
+        self.push(module, Op::Conv2d(op), &[input])
     }
 
     /// Linear layer with bias.
