@@ -27,7 +27,8 @@ fn expected_operators(fault: Fault) -> &'static [&'static str] {
         Fault::GateOrder | Fault::ResetBeforeBias | Fault::TanhNextEntry | Fault::GoalFirstStepOnly => {
             &["waypoint_decoder"]
         }
-        Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention", "softmax"],
+        Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention", "softmax", "spatial_softmax"],
+        Fault::PointAxes => &["spatial_softmax"],
         Fault::LayerNormEpsilon => &["layer_norm"],
         Fault::DepthTail | Fault::MultiplierPlusOne | Fault::ChannelsSwapped => WEIGHTED,
         // Where the bytes in front of the scratch belong to an operand of the same step, the engine refuses to cut

@@ -1,11 +1,14 @@
-//! The f32 reference meets what the original networks gave: waypoints and the means of inner features, at full size,
-//! for the graph as imported and as optimized.
+//! The f32 reference meets what the original networks gave: waypoints (of LBC points and the statistics of its logits) and
+//! the means of inner features, at full size, for the graph as imported and as optimized.
 
+use host_sim::points::PixelGrid;
 use host_sim::statistics::ErrorSums;
 use model_compiler::import::{ImportOptions, System, import};
 use model_compiler::ir::{Graph, InputKind, ValueId};
 use model_compiler::{passes, reference};
 use std::collections::BTreeMap;
+use tests::build;
+use tests::commands::{self, Folder};
 use tests::golden::{self, Expected, Frame};
 
 /// Meters.
@@ -16,12 +19,17 @@ const WAYPOINT_TOLERANCE: f32 = 1e-3;
 const TAP_TOLERANCE: f32 = 1e-3;
 const TAP_FLOOR: f32 = 1e-2;
 
+/// Of −1..1, and of logits of order 1.
+const POINT_TOLERANCE: f32 = 1e-3;
+const LOGIT_TOLERANCE: f32 = 1e-3;
+
 fn raw_inputs(graph: &Graph, frame: &Frame) -> Vec<Vec<f32>> {
     let raw = |kind| match kind {
         InputKind::Image => frame.rgb.clone(),
         InputKind::Bev => frame.bev.clone(),
         InputKind::Velocity => vec![frame.velocity],
         InputKind::Goal => frame.target.to_vec(),
+        InputKind::Views => frame.views.clone(),
     };
     graph.inputs().map(|(_, kind)| raw(kind)).collect()
 }
@@ -105,4 +113,65 @@ fn late_fusion_meets_the_original() {
 #[test]
 fn transfuser_meets_the_original() {
     meets_the_original(System::TransFuser);
+}
+
+/// Mean and standard deviation of each map.
+fn statistics(maps: &[f32], channels: usize) -> Vec<[f32; 2]> {
+    let mean = spatial_mean(maps, channels);
+    let deviation = |c: usize| {
+        let squares = maps.iter().skip(c).step_by(channels).map(|&x| (f64::from(x) - f64::from(mean[c])).powi(2));
+        (squares.sum::<f64>() / ((maps.len() / channels) as f64 - 1.0)).sqrt() as f32
+    };
+    (0..channels).map(|c| [mean[c], deviation(c)]).collect()
+}
+
+fn largest_error(found: &[[f32; 2]], expected: &[[f32; 2]]) -> f32 {
+    assert_eq!(found.len(), expected.len());
+    let mut errors = ErrorSums::default();
+    errors.add(expected.as_flattened(), found.as_flattened());
+    errors.largest_error() as f32
+}
+
+#[test]
+fn lbc_meets_the_original() {
+    let (expected, logits) = (golden::expected(System::Lbc).waypoints, golden::lbc::expected_logits());
+    let mut graph = import("lbc", golden::checkpoint(System::Lbc), &ImportOptions::default()).unwrap();
+    for what in ["as imported", "optimized"] {
+        let maps = graph.find("net.network").expect("the enlarged logits");
+        let grid = PixelGrid::of_graph(&graph).expect("points");
+        let (mut worst_point, mut worst_logit) = (0.0_f32, 0.0_f32);
+        for (i, frame) in golden::frames().iter().enumerate() {
+            let mut seen = Vec::new();
+            let outputs = reference::run(&graph, &raw_inputs(&graph, frame), |node, data| {
+                if node.output == maps {
+                    seen = statistics(data, 4);
+                }
+            });
+            let points: Vec<[f32; 2]> =
+                grid.points(&outputs.unwrap()[0]).iter().map(|point| point.map(|v| v as f32)).collect();
+            worst_logit = worst_logit.max(largest_error(&seen, &logits[i]));
+            worst_point = worst_point.max(largest_error(&points, &expected[i]));
+        }
+        println!("lbc, {what}: points within {worst_point:.1e}, statistics of the logits within {worst_logit:.1e}");
+        assert!(within(worst_point, POINT_TOLERANCE) && within(worst_logit, LOGIT_TOLERANCE), "{what}");
+        passes::optimize(&mut graph).unwrap();
+    }
+}
+
+/// The same through the command line, from files.
+#[test]
+fn lbc_meets_the_original_through_host_sim() {
+    let folder = Folder::default();
+    golden::write_safetensors(&golden::checkpoint(System::Lbc), &folder.path("lbc.safetensors")).unwrap();
+    folder.write("inputs.safetensors", commands::views_file(&build::views((144, 256))));
+    let (status, report) =
+        folder.json("host-sim run @lbc.safetensors --inputs @inputs.safetensors --frames-limit 2 --json");
+    assert_eq!(status, 0);
+    for (i, expected) in golden::expected(System::Lbc).waypoints.iter().take(2).enumerate() {
+        let points = report["frames"][i]["points"].as_array().expect("points");
+        let values = points.iter().flat_map(|point| point.as_array().expect("a pair")).filter_map(|v| v.as_f64());
+        let points: Vec<f32> = values.map(|v| v as f32).collect();
+        let error = largest_error(points.as_chunks().0, expected);
+        assert!(within(error, POINT_TOLERANCE), "frame {i}: {points:?}, expected {expected:?}");
+    }
 }

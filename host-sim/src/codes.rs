@@ -42,7 +42,7 @@ pub fn clip_range(tensor: &QTensor, op: &QOp) -> [f64; 2] {
     [low, high].map(|code| tensor.scale * (f64::from(code) - f64::from(tensor.zero_point)))
 }
 
-/// Clamp and zero point of an operator's output; `None` for copies, probabilities and waypoints.
+/// Clamp and zero point of an operator's output; `None` for copies, probabilities, points and waypoints.
 fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
     match op {
         QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } => Some((rescale.clamp, rescale.zero_point)),
@@ -55,7 +55,11 @@ fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
         | QOp::LayerNorm { clamp, zero_point, .. }
         | QOp::Attention { clamp, zero_point, .. }
         | QOp::Concat { clamp, zero_point, .. } => Some((*clamp, *zero_point)),
-        QOp::MaxPool { .. } | QOp::CopyBox { .. } | QOp::Softmax { .. } | QOp::WaypointDecoder(_) => None,
+        QOp::MaxPool { .. }
+        | QOp::CopyBox { .. }
+        | QOp::Softmax { .. }
+        | QOp::SpatialSoftmax { .. }
+        | QOp::WaypointDecoder(_) => None,
     }
 }
 
@@ -68,7 +72,7 @@ pub struct SaturationBounds {
 }
 
 impl SaturationBounds {
-    /// The bounds of a step; `None` where its output cannot saturate (copies, probabilities, waypoints).
+    /// The bounds of a step; `None` where its output cannot saturate (copies, probabilities, points, waypoints).
     pub fn of(step: &QStep) -> Option<Self> {
         let (clamp, zero_point) = output_clamp(&step.op)?;
         let Clamp { min, max } = clamp;

@@ -49,7 +49,8 @@ pub struct StepChange {
 /// A figure of the whole.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FigureChange {
-    /// `arena`, `flash`, `pooled vector`, `output`, `worst step`, `waypoint K, mean`, `waypoint K, max`.
+    /// `arena`, `flash`, `pooled vector`, `output`, `worst step`, `waypoint K, mean`, `waypoint K, max`,
+    /// `point K, mean`, `point K, max`.
     pub figure: String,
     /// `B`, `dB` or `mm`.
     pub unit: String,
@@ -146,6 +147,10 @@ fn figures(before: &VerifyReport, after: &VerifyReport) -> Vec<FigureChange> {
     for (k, (old, new)) in old.waypoint_error_mm.iter().zip(&new.waypoint_error_mm).enumerate() {
         figures.push(figure(&format!("waypoint {}, mean", k + 1), "mm", Some(old.mean), Some(new.mean)));
         figures.push(figure(&format!("waypoint {}, max", k + 1), "mm", Some(old.max), Some(new.max)));
+    }
+    for (k, (old, new)) in old.point_error_px.iter().zip(&new.point_error_px).enumerate() {
+        figures.push(figure(&format!("point {}, mean", k + 1), "px", Some(old.mean), Some(new.mean)));
+        figures.push(figure(&format!("point {}, max", k + 1), "px", Some(old.max), Some(new.max)));
     }
     figures.retain(|figure| figure.before.is_some() && figure.after.is_some());
     figures

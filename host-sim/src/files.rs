@@ -115,8 +115,9 @@ pub fn load_graph(path: &Path, import: &ImportOptions) -> Result<Graph> {
 #[derive(Clone, Debug, Default, PartialEq, Eq, clap::Args)]
 #[group(skip)]
 pub struct FrameSource {
-    /// Frame directory: a folder per frame with rgb.png, lidar.bin and frame.json; for classifiers: a folder of images,
-    /// optionally with labels.csv (lines FILE,LABEL or FILE,LABEL,NAME).
+    /// Frame directory: a folder per frame with rgb.png, lidar.bin and frame.json (lbc: rgb.png, rgb_left.png,
+    /// rgb_right.png and frame.json); for classifiers: a folder of images, optionally with labels.csv (lines FILE,LABEL
+    /// or FILE,LABEL,NAME).
     #[arg(long, value_name = "DIR", required_unless_present = "inputs", conflicts_with = "inputs")]
     pub frames: Option<PathBuf>,
     /// Raw network inputs by name, first dimension = frames; of a classifier also `label`.
@@ -190,7 +191,7 @@ pub fn frame_format(image: &Image<'_>) -> Result<FrameFormat> {
 /// # Errors
 /// The name is unknown, and it is no image.
 pub fn input_kind(port: &Port<'_>) -> Result<InputKind> {
-    let kinds = [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal];
+    let kinds = [InputKind::Image, InputKind::Bev, InputKind::Velocity, InputKind::Goal, InputKind::Views];
     let named = kinds.into_iter().find(|&kind| frames::input_name(kind) == port.name);
     let is_image = port.scale == 1.0 && port.zero_point == -128;
     named.or(is_image.then_some(InputKind::Image)).ok_or_else(|| {

@@ -3,7 +3,7 @@
 //! * [`backends`]: which of the firmware's kernels this machine can run
 //! * [`mod@bench`]: latency per step and whole, the backends side by side
 //! * [`demo`]: the whole way on the files of the source tree, without arguments
-//! * [`run`]: waypoints or classes of frames, int8 from an image or f32 from a checkpoint
+//! * [`run`]: waypoints, [`points`] or classes of frames, int8 from an image or f32 from a checkpoint
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
 //!   f32 network: how much precision each step costs
 //! * [`report`]: what was found, as text, JSON and one HTML page; [`diff`] against an earlier report, [`gates`] for CI,
@@ -33,6 +33,7 @@ pub mod files;
 pub mod gates;
 pub mod histogram;
 pub mod noise;
+pub mod points;
 pub mod report;
 pub mod run;
 pub mod statistics;

@@ -15,6 +15,7 @@ use crate::diff::Diff;
 use crate::gates::GateOutcome;
 use crate::histogram::Histogram;
 use crate::noise::NoiseShares;
+use crate::points::Points;
 use crate::run::{ModelInfo, Waypoints};
 use memory::MemoryReport;
 use model_compiler::artifact;
@@ -100,7 +101,10 @@ pub struct Summary {
     #[serde(default)]
     pub output_sqnr_db: Option<f64>,
     /// Distance of waypoint k from the f32 network's.
-    pub waypoint_error_mm: Vec<WaypointError>,
+    pub waypoint_error_mm: Vec<MeanAndMax>,
+    /// Distance of point k from the f32 network's, pixels.
+    #[serde(default)]
+    pub point_error_px: Vec<MeanAndMax>,
     /// Size of the arena, bytes.
     pub arena_bytes: u64,
     /// Its lower bound, bytes.
@@ -115,9 +119,9 @@ pub struct Summary {
     pub accuracy: Option<ClassificationSummary>,
 }
 
-/// Mean and maximum over the frames, mm.
+/// Mean and maximum over the frames.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct WaypointError {
+pub struct MeanAndMax {
     /// Mean.
     pub mean: f64,
     /// Maximum.
@@ -198,12 +202,21 @@ pub struct FrameReport {
     pub waypoints: Option<Waypoints>,
     /// Of the f32 network.
     pub reference_waypoints: Option<Waypoints>,
+    /// Of the engine, −1..1.
+    #[serde(default)]
+    pub points: Option<Points>,
+    /// Of the f32 network.
+    #[serde(default)]
+    pub reference_points: Option<Points>,
     /// What a classifier says.
     #[serde(flatten)]
     pub classes: Option<ClassifiedFrame>,
     /// Distance of both, per waypoint, mm; empty where one is missing.
     #[serde(default)]
     pub waypoint_error_mm: Vec<f64>,
+    /// Distance of both, per point, pixels; empty where one is missing.
+    #[serde(default)]
+    pub point_error_px: Vec<f64>,
 }
 
 impl StepReport {
@@ -227,9 +240,9 @@ impl StepReport {
 }
 
 impl FrameReport {
-    /// How bad the frame is, for sorting: the largest waypoint error in mm, else the noise of the output.
+    /// How bad the frame is, for sorting: the largest error of a waypoint or point, else the noise of the output.
     pub fn badness(&self) -> f64 {
-        let largest = self.waypoint_error_mm.iter().copied().reduce(f64::max);
+        let largest = self.waypoint_error_mm.iter().chain(&self.point_error_px).copied().reduce(f64::max);
         largest.or(self.output_sqnr_db.map(|db| -db)).unwrap_or(f64::NEG_INFINITY)
     }
 }
@@ -309,7 +322,8 @@ pub(crate) mod tests {
                 vector_sqnr_db: Some(30.0),
                 output_step: Some("conv1".into()),
                 output_sqnr_db: Some(21.5),
-                waypoint_error_mm: vec![WaypointError { mean: 1.25, max: 2.5 }],
+                waypoint_error_mm: vec![MeanAndMax { mean: 1.25, max: 2.5 }],
+                point_error_px: vec![],
                 arena_bytes: 2048,
                 arena_bound_bytes: 2048,
                 arena_status: PlanStatus::Optimal,
@@ -331,8 +345,11 @@ pub(crate) mod tests {
                 output_sqnr_db: Some(21.5),
                 waypoints: Some(vec![[0.0, 1.0]]),
                 reference_waypoints: Some(vec![[0.0, 1.001]]),
+                points: None,
+                reference_points: None,
                 classes: None,
                 waypoint_error_mm: vec![1.0],
+                point_error_px: vec![],
             }],
             gates: vec![],
             baseline: None,

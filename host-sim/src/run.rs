@@ -1,10 +1,11 @@
-//! Waypoints or classes of frames: int8 from an image, f32 from a checkpoint.
+//! Waypoints, points or classes of frames: int8 from an image, f32 from a checkpoint.
 
 use crate::backends::Backend;
 use crate::buffers::GuardedArena;
 use crate::classification::{Accuracy, Classification};
 use crate::codes::decode;
 use crate::files::{self, FrameSource, ImageFile};
+use crate::points::{PixelGrid, Points};
 use firmware::engine::{Engine, EngineError};
 use firmware::image::{Image, Port, TensorRecord};
 use firmware::tensor::ElementType;
@@ -52,6 +53,11 @@ pub enum Output {
         /// Where to drive.
         waypoints: Waypoints,
     },
+    /// Of a driving network that points into its image.
+    Points {
+        /// Where to drive.
+        points: Points,
+    },
     /// Of a classifier.
     Class(Classification),
 }
@@ -78,7 +84,7 @@ impl RunReport {
     pub fn new(model: ModelInfo, frames: Vec<FrameResult>) -> Self {
         let classes = frames.iter().filter_map(|frame| match &frame.output {
             Output::Class(classification) => Some(classification),
-            Output::Waypoints { .. } => None,
+            Output::Waypoints { .. } | Output::Points { .. } => None,
         });
         let accuracy = Accuracy::of(classes);
         Self { schema: 1, model, frames, accuracy, class_names: BTreeMap::new() }
@@ -94,7 +100,7 @@ impl RunReport {
 /// Runs a model image (int8, on the firmware's engine) or a checkpoint (f32) over frames.
 ///
 /// # Errors
-/// The model or a frame cannot be read, or the network gives neither waypoints nor classes.
+/// The model or a frame cannot be read, or the network gives neither waypoints nor points nor classes.
 pub fn run(
     model: &Path,
     import: &ImportOptions,
@@ -115,9 +121,11 @@ fn run_image(file: &ImageFile, source: &FrameSource, backend: Backend, progress:
     let image = file.parse()?;
     let format = files::frame_format(&image)?;
     let mut device = Device::new(image, backend)?;
-    let kind = match device.record.element == ElementType::I32 && device.record.shape.channels == 2 {
-        true => OutputKind::Waypoints,
-        false => OutputKind::of_classifier(&format, image.name())?,
+    let gives_pairs = device.record.element == ElementType::I32 && device.record.shape.channels == 2;
+    let kind = match PixelGrid::of_image(&image, device.port.tensor) {
+        Some(grid) => OutputKind::Points(grid),
+        None if gives_pairs => OutputKind::Waypoints,
+        None => OutputKind::of_classifier(&format, image.name())?,
     };
     let frames = source.load(&format)?;
     let results = each_frame(&frames, progress, |frame| Ok(kind.read(device.infer(frame)?, frame)))?;
@@ -128,9 +136,10 @@ fn run_image(file: &ImageFile, source: &FrameSource, backend: Backend, progress:
 fn run_graph(graph: &Graph, model: ModelInfo, source: &FrameSource, progress: &ProgressBar) -> Result<RunReport> {
     let format = FrameFormat::of_graph(graph);
     let gives_waypoints = graph.outputs.first().and_then(|&id| graph.producer(id));
-    let kind = match gives_waypoints.is_some_and(|node| matches!(node.op, Op::WaypointDecoder(_))) {
-        true => OutputKind::Waypoints,
-        false => OutputKind::of_classifier(&format, &graph.name)?,
+    let kind = match PixelGrid::of_graph(graph) {
+        Some(grid) => OutputKind::Points(grid),
+        None if gives_waypoints.is_some_and(|node| matches!(node.op, Op::WaypointDecoder(_))) => OutputKind::Waypoints,
+        None => OutputKind::of_classifier(&format, &graph.name)?,
     };
     let frames = source.load(&format)?;
     let results = each_frame(&frames, progress, |frame| {
@@ -160,13 +169,14 @@ fn each_frame(
 #[derive(Clone, Copy)]
 enum OutputKind {
     Waypoints,
+    Points(PixelGrid),
     Classes,
 }
 
 impl OutputKind {
     fn of_classifier(format: &FrameFormat, name: &str) -> Result<Self> {
         format.classes.map(|_| Self::Classes).ok_or_else(|| {
-            let message = "its first output holds neither waypoints nor classes";
+            let message = "its first output holds neither waypoints nor points nor classes";
             Error::new(ErrorCode::Unsupported, format!("network {name}"), message)
         })
     }
@@ -174,6 +184,7 @@ impl OutputKind {
     fn read(self, values: Vec<f64>, frame: &Frame) -> Output {
         match self {
             Self::Waypoints => Output::Waypoints { waypoints: waypoints(&values) },
+            Self::Points(grid) => Output::Points { points: grid.points(&values) },
             Self::Classes => Output::Class(Classification::new(values, frame)),
         }
     }

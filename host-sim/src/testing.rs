@@ -61,16 +61,7 @@ pub fn graph() -> Graph {
 /// A frame whose pixels follow from a seed.
 pub fn frame(seed: u8) -> Frame {
     let data = (0..48_u8).map(|i| i.wrapping_mul(37).wrapping_add(seed.wrapping_mul(91))).collect();
-    Frame {
-        name: format!("frame {seed}"),
-        rgb: Some(ByteMap { shape: CAMERA, data }),
-        bev: None,
-        velocity: None,
-        goal: None,
-        command: None,
-        dropped_points: 0,
-        label: None,
-    }
+    Frame { name: format!("frame {seed}"), rgb: Some(ByteMap { shape: CAMERA, data }), ..Frame::default() }
 }
 
 fn qmodel() -> QModel {

@@ -26,7 +26,7 @@ const CHANNELS: usize = 4;
 const SIZE: u16 = 16;
 
 /// Names of all operators, as [`firmware::program::Step::name`] gives them.
-pub const OPERATORS: [&str; 15] = [
+pub const OPERATORS: [&str; 16] = [
     "conv2d",
     "linear",
     "max_pool",
@@ -42,6 +42,7 @@ pub const OPERATORS: [&str; 15] = [
     "copy_box",
     "concat",
     "softmax",
+    "spatial_softmax",
 ];
 
 /// The float network.
@@ -68,7 +69,8 @@ pub fn graph() -> Graph {
     let decoder = b.decoder();
     let waypoints = b.push("waypoints", decoder, &[hidden, goal]);
     let probabilities = b.classifier(image, lidar, bev);
-    b.graph.outputs.extend([waypoints, probabilities]);
+    let points = b.points(image);
+    b.graph.outputs.extend([waypoints, probabilities, points]);
     b.graph
 }
 
@@ -86,9 +88,7 @@ pub fn frames(seed: u64, count: usize) -> Vec<Frame> {
         bev: map(2, 6),
         velocity: Some(1.5 * i as f64),
         goal: Some([2.0 - i as f64, -8.0 - 3.0 * i as f64]),
-        command: None,
-        dropped_points: 0,
-        label: None,
+        ..Frame::default()
     };
     (0..count).map(frame).collect()
 }
@@ -248,6 +248,13 @@ impl Builder {
         self.push("class.probabilities", Op::Concat(Axis::Width), &[probabilities, counts])
     }
 
+    /// Logits enlarged in 16 bits, and the pixel that each map expects.
+    fn points(&mut self, image: ValueId) -> ValueId {
+        let logits = self.conv("points.logits", &[image], Window::square(1, 1, 0), 1, None, Clip::NONE);
+        let enlarged = self.push("points.enlarged", Op::ResizeBilinear { factor: (2, 3) }, &[logits]);
+        self.push("points", Op::SpatialSoftmax { temperature: 0.5 }, &[enlarged])
+    }
+
     fn decoder(&mut self) -> Op {
         Op::WaypointDecoder(WaypointDecoder {
             input_weights: self.weights(&[3 * CHANNELS, 2]),
@@ -266,7 +273,7 @@ mod tests {
     use super::*;
     use firmware::engine::Engine;
     use firmware::kernels::Portable;
-    use firmware::program::{Requant, Residual, Step};
+    use firmware::program::{Requant, Residual, ResizeBilinear, Step};
     use firmware::tensor::{ElementType, TensorId};
     use model_compiler::emit::emit;
 
@@ -302,6 +309,10 @@ mod tests {
         assert!(forms(&|s| matches!(s, Step::Concat(s) if s.first.requant != exact)), "rescaled");
         assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I16)));
         assert!(forms(&|s| matches!(s, Step::Softmax(s) if element(s.input) == ElementType::I8)));
+        let wide_enlargement = |s: &ResizeBilinear| {
+            [s.input.tensor, s.output].map(element) == [ElementType::I16; 2] && s.weight_bits == 11
+        };
+        assert!(forms(&|s| matches!(s, Step::ResizeBilinear(s) if wide_enlargement(s))), "logits stay in 16 bits");
         let in_place = parts.tensors.iter().filter(|tensor| tensor.in_place_of.is_some()).count();
         assert!(in_place >= 3, "{in_place} tensors in place");
     }

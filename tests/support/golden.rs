@@ -9,8 +9,10 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+pub mod lbc;
 pub mod network;
 
+pub use lbc::Lbc;
 pub use network::Network;
 
 /// Salt of the generated weights that the stored vectors belong to.
@@ -18,6 +20,9 @@ const SALT: u64 = 1;
 
 /// Side of the stored frames, pixels.
 const FRAME_SIZE: usize = 256;
+
+/// Height and width of the stored views of LBC, pixels.
+pub const VIEWS: [usize; 2] = [144, 256];
 
 /// A file of `tests/golden`.
 pub fn path(file: &str) -> PathBuf {
@@ -136,6 +141,8 @@ pub struct Frame {
     pub target: [f32; 2],
     /// Navigation command 1..=6.
     pub command: i32,
+    /// Views and heatmap of LBC, [`VIEWS`]`×10` grey levels.
+    pub views: Vec<f32>,
 }
 
 impl Frame {
@@ -154,6 +161,16 @@ impl Frame {
         };
         Self { rgb: crop(&self.rgb, 3), bev: crop(&self.bev, 2), ..self.clone() }
     }
+
+    /// The first rows and columns around the middle of the views.
+    ///
+    /// # Panics
+    /// The size exceeds the stored one.
+    pub fn cropped_views(&self, height: usize, width: usize) -> Vec<f32> {
+        let (top, left) = ((VIEWS[0] - height) / 2, (VIEWS[1] - width) / 2);
+        let row = |y: usize| &self.views[((top + y) * VIEWS[1] + left) * 10..][..width * 10];
+        (0..height).flat_map(row).copied().collect()
+    }
 }
 
 /// The stored frames.
@@ -162,12 +179,14 @@ pub fn frames() -> Vec<Frame> {
     let (rgb, bev) = (file.bytes("rgb"), file.bytes("bev"));
     let (velocity, target) = (file.float("velocity"), file.float("target"));
     let command = file.bytes("command");
+    let views = file.bytes("lbc_views");
     let frame = |i: usize| Frame {
         rgb: channels_last(&rgb, i, 3),
         bev: channels_last(&bev, i, 2),
         velocity: velocity[i],
         target: [target[2 * i], target[2 * i + 1]],
         command: i32::from_le_bytes(command[4 * i..][..4].try_into().expect("four bytes")),
+        views: lbc::views(&views, i),
     };
     (0..velocity.len()).map(frame).collect()
 }
@@ -182,7 +201,7 @@ fn channels_last(maps: &[u8], i: usize, channels: usize) -> Vec<f32> {
 /// What the original network gave for the stored frames.
 #[derive(Clone, Debug)]
 pub struct Expected {
-    /// Per frame: waypoints `[right, forward-negative]`, m.
+    /// Per frame: waypoints `[right, forward-negative]`, m; of LBC points `[x, y]`, −1..1.
     pub waypoints: Vec<[[f32; 2]; 4]>,
     /// Module name to spatial mean per frame and channel (of a transformer: of its image tokens' part).
     pub taps: BTreeMap<String, Vec<Vec<f32>>>,
@@ -191,7 +210,7 @@ pub struct Expected {
 /// The stored results of a system.
 pub fn expected(system: System) -> Expected {
     let file = Stored::read(&format!("{}.safetensors", system.name()));
-    let waypoints = file.float("expect.waypoints");
+    let waypoints = file.float(if system == System::Lbc { "expect.points" } else { "expect.waypoints" });
     let waypoints = waypoints.chunks_exact(8).map(|w| std::array::from_fn(|t| [w[2 * t], w[2 * t + 1]])).collect();
     let frames =
         |values: &[f32], count: usize| values.chunks_exact(values.len() / count).map(<[f32]>::to_vec).collect();
@@ -235,7 +254,7 @@ struct Stored {
 }
 
 impl Stored {
-    fn read(name: &str) -> Self {
+    pub(super) fn read(name: &str) -> Self {
         Self { file: std::fs::read(path(name)).unwrap_or_else(|e| panic!("{name}: {e}")) }
     }
 
@@ -247,7 +266,7 @@ impl Stored {
         self.tensors().tensor(name).unwrap_or_else(|e| panic!("{name}: {e}")).data().to_vec()
     }
 
-    fn float(&self, name: &str) -> Vec<f32> {
+    pub(super) fn float(&self, name: &str) -> Vec<f32> {
         to_floats(&self.bytes(name))
     }
 
@@ -279,9 +298,12 @@ mod tests {
 
     #[test]
     fn checkpoints_equal_those_of_the_python_generator() {
-        for (system, expected) in
-            [(System::Aim, 0x2608_0f08), (System::LateFusion, 0xcd82_6882), (System::TransFuser, 0x9953_4b15)]
-        {
+        for (system, expected) in [
+            (System::Aim, 0x2608_0f08),
+            (System::LateFusion, 0xcd82_6882),
+            (System::TransFuser, 0x9953_4b15),
+            (System::Lbc, 0x0497_a3a4),
+        ] {
             assert_eq!(crc(&checkpoint(system)), expected, "{}", system.name());
         }
     }
@@ -317,6 +339,8 @@ mod tests {
         assert_eq!(frames[2].target, [3.25, -45.0]);
         for frame in &frames {
             assert_eq!((frame.rgb.len(), frame.bev.len()), (256 * 256 * 3, 256 * 256 * 2));
+            assert_eq!(frame.views.len(), 144 * 256 * 10);
+            assert_eq!(frame.cropped_views(32, 64)[..10], frame.views[(56 * 256 + 96) * 10..][..10]);
             assert!(frame.rgb.iter().all(|v| (0.0..=255.0).contains(v)) && frame.rgb.iter().any(|&v| v > 100.0));
             assert!(frame.bev.iter().all(|v| (0.0..=5.0).contains(v)) && frame.bev.iter().any(|&v| v > 0.0));
             assert!((1..=6).contains(&frame.command));

@@ -46,16 +46,7 @@ pub fn frames(graph: &Graph, seed: u64, count: usize) -> Vec<Frame> {
             values[channel] as u8
         };
         let data = (0..shape.elements() as usize).map(|element| pixel(element % 3)).collect();
-        Frame {
-            name: format!("random {i} of seed {seed}"),
-            rgb: Some(ByteMap { shape, data }),
-            bev: None,
-            velocity: None,
-            goal: None,
-            command: None,
-            dropped_points: 0,
-            label: None,
-        }
+        Frame { name: format!("random {i} of seed {seed}"), rgb: Some(ByteMap { shape, data }), ..Frame::default() }
     };
     (0..count).map(frame).collect()
 }

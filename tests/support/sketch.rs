@@ -4,7 +4,7 @@ use firmware::image::layout::{header, region, tensor};
 use firmware::image::{Check, SectionKind, TensorRecord, layout};
 use firmware::program::{
     Add, Attention, AveragePool, Clamp, ConstRange, Conv2d, CopyBox, KernelId, LayerNorm, Linear, MaxPool, Requant,
-    Requantize, Rescale, Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, Window,
+    Requantize, Rescale, Residual, ResizeBilinear, SpatialSoftmax, Step, Term, TokenSource, Tokens, Window,
 };
 use firmware::tensor::{ElementType, Shape, TensorId};
 use model_compiler::emit::{ImageParts, ImagePort, assemble, reseal};
@@ -465,6 +465,7 @@ fn of_operators() -> Vec<(Check, Vec<u8>)> {
         (Check::StepElement, words_as_codes()),
         (Check::StepBox, boxed([2, 1, 1], 0)),
         (Check::StepBorder, boxed([1, 1, 1], 200)),
+        (Check::StepPixels, wide_spatial_softmax()),
         (Check::Work, sealed(&work.finish(sums))),
     ]
 }
@@ -571,6 +572,17 @@ fn boxed(begin: [u16; 3], border: i16) -> Vec<u8> {
     let output = sketch.tensor(ElementType::I8, Shape::map(2, 2, 2));
     let (stride, size, before) = ([1; 3], [1; 3], [1; 3]);
     sketch.steps.push(Step::CopyBox(CopyBox { input, output, begin, stride, size, before, border }));
+    sealed(&sketch.finish(output))
+}
+
+/// One row of logits, a pixel longer than can be summed.
+fn wide_spatial_softmax() -> Vec<u8> {
+    let mut sketch = Sketch::default();
+    let input = sketch.tensor(ElementType::I16, Shape::map(1, 257, 1));
+    sketch.inputs.push(input);
+    let output = sketch.tensor(ElementType::I32, Shape::tokens(1, 2));
+    let exp_table = sketch.constant(2 * 257);
+    sketch.steps.push(Step::SpatialSoftmax(SpatialSoftmax { input, output, exponent: HALF, exp_table }));
     sealed(&sketch.finish(output))
 }
 

@@ -19,6 +19,7 @@ mod histogram;
 mod memory;
 mod noise;
 mod plot;
+mod points;
 mod steps;
 mod summary;
 mod tensors;
@@ -41,6 +42,7 @@ pub fn page(report: &VerifyReport, frames: &[Frame]) -> String {
         (channels::section(&report.steps))
         (memory::section(&report.memory, &report.summary))
         (waypoints::section(&report.frames, frames))
+        (points::section(&report.frames, frames))
         (classes::section(report.summary.accuracy.as_ref(), &report.frames))
         (frames::section(&report.frames))
         (steps::section(&report.steps))

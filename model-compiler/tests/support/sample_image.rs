@@ -40,8 +40,9 @@ pub mod ids {
     pub const BOX: u16 = 23;
     pub const JOINED: u16 = 24;
     pub const PROBABILITIES: u16 = 25;
+    pub const POINTS: u16 = 26;
     /// First scratch record.
-    pub const SCRATCH: u16 = 26;
+    pub const SCRATCH: u16 = 27;
 }
 
 /// Positions of the sample's steps.
@@ -66,9 +67,10 @@ pub mod at {
     pub const COPY_BOX: usize = 19;
     pub const CONCAT: usize = 20;
     pub const SOFTMAX: usize = 21;
+    pub const SPATIAL_SOFTMAX: usize = 22;
 }
 
-pub const STEPS: usize = 22;
+pub const STEPS: usize = 23;
 
 /// Deterministic constants.
 struct Numbers {
@@ -151,7 +153,11 @@ pub fn parts() -> ImageParts {
             port("velocity", ids::VELOCITY),
             port("goal", ids::GOAL),
         ],
-        outputs: vec![port("waypoints", ids::WAYPOINTS), port("probabilities", ids::PROBABILITIES)],
+        outputs: vec![
+            port("waypoints", ids::WAYPOINTS),
+            port("probabilities", ids::PROBABILITIES),
+            port("points", ids::POINTS),
+        ],
         arena_bytes,
         arena_alignment: 16,
         qmodel_digest: [7; 32],
@@ -189,6 +195,7 @@ fn shapes() -> Vec<(Shape, ElementType)> {
         (Shape::map(3, 4, 8), I8),
         (Shape::map(7, 4, 8), I16),
         (Shape::map(7, 4, 8), I16),
+        (Shape::tokens(8, 2), I32),
     ]
 }
 
@@ -257,6 +264,7 @@ fn steps(n: &mut Numbers) -> Vec<Step> {
         }),
         concat(),
         softmax(n),
+        spatial_softmax(n),
     ]
 }
 
@@ -409,6 +417,15 @@ fn softmax(n: &mut Numbers) -> Step {
         input: TensorId(ids::JOINED),
         output: TensorId(ids::PROBABILITIES),
         exponent: Requant { shift: 12, ..requant() },
+        exp_table: n.builder.push(&exp_table()).expect("fits"),
+    })
+}
+
+fn spatial_softmax(n: &mut Numbers) -> Step {
+    Step::SpatialSoftmax(SpatialSoftmax {
+        input: TensorId(ids::PROBABILITIES),
+        output: TensorId(ids::POINTS),
+        exponent: Requant { shift: 18, ..requant() },
         exp_table: n.builder.push(&exp_table()).expect("fits"),
     })
 }

@@ -53,7 +53,7 @@ impl Recording {
             goal: Some([self.goal[0], 0.0 - self.goal[1]]),
             command: Some(COMMAND),
             dropped_points,
-            label: None,
+            ..Frame::default()
         }
     }
 

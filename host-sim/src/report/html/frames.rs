@@ -15,7 +15,9 @@ pub(super) fn section(frames: &[FrameReport]) -> Markup {
     let mut sorted: Vec<&FrameReport> = frames.iter().collect();
     sorted.sort_by(|a, b| b.badness().total_cmp(&a.badness()));
     let row = |frame: &&FrameReport| {
-        let errors: Vec<String> = frame.waypoint_error_mm.iter().map(|&mm| figure(Some(mm), 0)).collect();
+        let waypoints = frame.waypoint_error_mm.iter().map(|&mm| figure(Some(mm), 0));
+        let points = frame.point_error_px.iter().map(|&pixels| figure(Some(pixels), 2));
+        let errors: Vec<String> = waypoints.chain(points).collect();
         vec![
             frame.name.clone(),
             if frame.calibration { "yes" } else { "no" }.to_owned(),
@@ -27,8 +29,11 @@ pub(super) fn section(frames: &[FrameReport]) -> Markup {
         ]
     };
     let rows: Vec<_> = sorted.iter().take(SHOWN).map(row).collect();
-    let header =
-        ["frame", "calibration", "worst step", "its dB", "pooled vector, dB", "first output, dB", "waypoint error, mm"];
+    let error = match frames.iter().any(|frame| !frame.point_error_px.is_empty()) {
+        true => "point error, px",
+        false => "waypoint error, mm",
+    };
+    let header = ["frame", "calibration", "worst step", "its dB", "pooled vector, dB", "first output, dB", error];
     let about = html! {
         "Figures of every frame by itself, the worst first."
         @if sorted.len() > SHOWN { " Shown are " (SHOWN) " of " (sorted.len()) " frames." }

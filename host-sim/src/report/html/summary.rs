@@ -97,6 +97,11 @@ fn figures(report: &VerifyReport) -> Vec<(&'static str, String, String)> {
         let note = format!("mean of waypoints 1 to {}; the last is {:.0} mm off at most", means.len(), last.max);
         figures.push(("Waypoint error", format!("{} mm", means.join(", ")), note));
     }
+    if let Some(last) = summary.point_error_px.last() {
+        let means: Vec<String> = summary.point_error_px.iter().map(|e| figure(Some(e.mean), 2)).collect();
+        let note = format!("mean of points 1 to {}; the last is {:.2} px off at most", means.len(), last.max);
+        figures.push(("Point error", format!("{} px", means.join(", ")), note));
+    }
     let arena = format!("bound {}: {}", bytes(summary.arena_bound_bytes), summary.arena_status.words());
     figures.push(("Arena", bytes(summary.arena_bytes), arena));
     figures.push(("Flash", bytes(summary.flash_bytes), String::new()));

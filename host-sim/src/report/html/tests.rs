@@ -66,9 +66,8 @@ fn frame() -> Frame {
         bev: Some(ByteMap { shape: Shape::map(4, 4, 2), data: vec![1; 32] }),
         velocity: Some(1.0),
         goal: Some([1.0, -20.0]),
-        command: None,
         dropped_points: 3,
-        label: None,
+        ..Frame::default()
     }
 }
 

@@ -159,7 +159,8 @@ fn camera_uri(map: &ByteMap) -> String {
     png_uri(&map.data, map.shape.width.into(), map.shape.height.into(), ExtendedColorType::Rgb8)
 }
 
-fn png_uri(pixels: &[u8], width: usize, height: usize, color: ExtendedColorType) -> String {
+/// A PNG file inside its address.
+pub(super) fn png_uri(pixels: &[u8], width: usize, height: usize, color: ExtendedColorType) -> String {
     let mut bytes = Vec::new();
     let encoder = PngEncoder::new(&mut bytes);
     encoder.write_image(pixels, width as u32, height as u32, color).expect("a map has its shape's number of bytes");
