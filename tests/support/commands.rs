@@ -4,7 +4,8 @@ use crate::build;
 use crate::golden::{self, Network};
 use crate::torch_file::Saved;
 use model_compiler::cli::Console;
-use model_compiler::frames::{ByteMap, Frame};
+use model_compiler::frames::views::LEVELS;
+use model_compiler::frames::{ByteMap, Frame, RealMap};
 use model_compiler::import::{NamedTensors, TensorData};
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
@@ -195,6 +196,25 @@ pub fn inputs_file(frames: &[Frame]) -> Vec<u8> {
         (*name, TensorView::new(*element, shape.clone(), data).expect("shape and data agree"))
     });
     safetensors::serialize(views, None).expect("names differ")
+}
+
+/// Frames of LBC as a `.safetensors` file of its raw input, 0..=1.
+///
+/// # Panics
+/// A frame lacks views.
+pub fn views_file(frames: &[Frame]) -> Vec<u8> {
+    let views = |frame: &Frame| frame.views.clone().expect("views");
+    let shape = views(&frames[0]).shape;
+    let planes = |frame: &Frame| {
+        let RealMap { data, shape } = views(frame);
+        let channels = usize::from(shape.channels);
+        let plane = |c: usize| data.iter().skip(c).step_by(channels).map(|v| v / LEVELS).collect::<Vec<_>>();
+        (0..channels).flat_map(plane).flat_map(f32::to_le_bytes).collect::<Vec<u8>>()
+    };
+    let data: Vec<u8> = frames.iter().flat_map(planes).collect();
+    let shape = vec![frames.len(), shape.channels.into(), shape.height.into(), shape.width.into()];
+    let view = TensorView::new(Dtype::F32, shape, &data).expect("shape and data agree");
+    safetensors::serialize([("lbc_input", view)], None).expect("one name")
 }
 
 /// A frame of a frame directory: `rgb.png`, `lidar.bin` with a few walls of points, `frame.json`.
