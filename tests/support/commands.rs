@@ -2,7 +2,7 @@
 
 use crate::build;
 use crate::golden::{self, Network};
-use crate::torch_file::Saved;
+use crate::torch_file::{Py, Saved};
 use model_compiler::cli::Console;
 use model_compiler::frames::views::LEVELS;
 use model_compiler::frames::{ByteMap, Frame, RealMap};
@@ -154,6 +154,21 @@ pub fn torch(tensors: &NamedTensors) -> Saved {
         })
         .collect();
     Saved::of_types(&stored)
+}
+
+/// A checkpoint as PyTorch Lightning saves it: the weights among hyper-parameters and what training left.
+pub fn lightning(saved: Saved) -> Vec<u8> {
+    let path = Py::Call("pathlib", "PosixPath", vec![Py::str("/"), Py::str("data")]);
+    let wrapped = saved.wrap(|weights| {
+        Py::dict([
+            ("epoch", Py::Int(29)),
+            ("optimizer_states", Py::List(vec![Py::dict([("lr", Py::Float(2e-4))])])),
+            ("state_dict", weights),
+            ("hparams_name", Py::str("hparams")),
+            ("hyper_parameters", Py::dict([("hack", Py::Bool(true)), ("dataset_dir", path)])),
+        ])
+    });
+    wrapped.zip()
 }
 
 /// Frames as a `.safetensors` file of raw network inputs.

@@ -164,11 +164,11 @@ pub fn parts() -> ImageParts {
             port("command", ids::COMMAND),
         ],
         outputs: vec![
-            port("waypoints", ids::WAYPOINTS),
+            ImagePort { scale: 1.0 / 65536.0, ..port("waypoints", ids::WAYPOINTS) },
             port("probabilities", ids::PROBABILITIES),
             port("gathered", ids::GATHERED),
             port("controls", ids::CONTROLS),
-            port("points", ids::POINTS),
+            ImagePort { scale: 1.0 / 64.0, ..port("points", ids::POINTS) },
         ],
         arena_bytes,
         arena_alignment: 16,
