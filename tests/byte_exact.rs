@@ -47,39 +47,28 @@ fn quantized(graph: &Graph, skip: SkipStages) -> QModel {
     build::quantized(graph, &QuantizeOptions { skip, ..Default::default() })
 }
 
-#[test]
-fn small_networks_are_byte_exact() {
-    for system in SYSTEMS {
-        let network = Network::small(system);
-        let graph = build::small(&network);
-        for skip in [SkipStages::narrow(), SkipStages::wide()] {
-            let model = quantized(&graph, skip);
-            for target in ["portable", "x86"] {
-                let compiled = build::compiled_for(&model, target);
-                for backend in Backend::all() {
-                    assert_byte_exact(&compiled, &build::frames_of(&graph), backend);
-                }
-                assert_self_test_passes(&compiled);
+/// Both types of skip values, for both targets, on every backend.
+fn assert_byte_exact_everywhere(graph: &Graph) {
+    for skip in [SkipStages::narrow(), SkipStages::wide()] {
+        let model = quantized(graph, skip);
+        for target in ["portable", "x86"] {
+            let compiled = build::compiled_for(&model, target);
+            for backend in Backend::all() {
+                assert_byte_exact(&compiled, &build::frames_of(graph), backend);
             }
+            assert_self_test_passes(&compiled);
         }
     }
 }
 
 #[test]
+fn small_networks_are_byte_exact() {
+    SYSTEMS.into_iter().for_each(|system| assert_byte_exact_everywhere(&build::small(&Network::small(system))));
+}
+
+#[test]
 fn small_lbc_is_byte_exact() {
-    for hack in [false, true] {
-        let graph = build::lbc(&Lbc::small(), hack);
-        for skip in [SkipStages::narrow(), SkipStages::wide()] {
-            let model = quantized(&graph, skip);
-            for target in ["portable", "x86"] {
-                let compiled = build::compiled_for(&model, target);
-                for backend in Backend::all() {
-                    assert_byte_exact(&compiled, &build::frames_of(&graph), backend);
-                }
-                assert_self_test_passes(&compiled);
-            }
-        }
-    }
+    [false, true].into_iter().for_each(|hack| assert_byte_exact_everywhere(&build::lbc(&Lbc::small(), hack)));
 }
 
 /// At half the resolution, which is a quarter of the work.

@@ -37,8 +37,8 @@ pub struct Variant {
 /// What a variant reaches over all evaluation frames.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fidelity {
-    /// SQNR of the pooled global vector (of the logits of points; of the first output where nothing is pooled), dB: power
-    /// sums over all frames.
+    /// SQNR of the pooled global vector (of the logits of points; of the first output where nothing is pooled), dB:
+    /// power sums over all frames.
     pub vector_sqnr_db: f64,
     /// Mean distance from the f32 waypoint, per waypoint, millimeters.
     pub mean_mm: Vec<f64>,

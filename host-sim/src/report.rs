@@ -258,7 +258,8 @@ impl FrameReport {
         found.values().zip(expected.values()).map(|((name, f), (_, e))| (name, (f - e).abs())).collect()
     }
 
-    /// How bad the frame is, for sorting: the largest error of a waypoint, control or point, else the noise of the output.
+    /// How bad the frame is, for sorting: the largest error of a waypoint, control or point, else the noise of the
+    /// output.
     pub fn badness(&self) -> f64 {
         let controls = self.control_errors().into_iter().map(|(_, error)| error);
         let places = self.waypoint_error_mm.iter().chain(&self.point_error_px).copied();

@@ -231,7 +231,8 @@ fn frame_report(record: &Record, frame: &Frame, trace: &FrameTrace, calibration:
     }
 }
 
-/// Position of the step that writes the last pooled vector; what points come from is a map, whatever is pooled beside it.
+/// Position of the step that writes the last pooled vector; what points come from is a map, whatever is pooled beside
+/// it.
 fn vector_position(record: &Record) -> Option<usize> {
     let is_pool = |&step: &u32| matches!(record.model.steps[step as usize].op, QOp::GlobalPool { .. });
     let points = record.model.outputs.first().and_then(|port| PixelGrid::of_model(&record.model, port.tensor));

@@ -208,9 +208,9 @@ pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
 
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
 ///
-/// Inputs are `rgb`, `bev`, `velocity`, `command`, `bev_points`, `cam_points`, `goal` and `views`, as far as the system has
-/// them, in raw units; the output is `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake) and
-/// `predicted_speed` (m/s), of LBC `points`. Values carry the names of the checkpoint's modules.
+/// Inputs are `rgb`, `bev`, `velocity`, `command`, `bev_points`, `cam_points`, `goal` and `views`, as far as the system
+/// has them, in raw units; the output is `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake) and
+/// `predicted_speed` (m/s), of LBC `points` (pixels). Values carry the names of the checkpoint's modules.
 ///
 /// # Errors
 /// `Unsupported`: no known system, or sizes that do not fit together. `Tensors`: the list of tensors that are missing,
@@ -228,8 +228,10 @@ fn unrecognized(tensors: &NamedTensors) -> Error {
     } else {
         format!("the tensor names are of no known system ({} tensors: {}, …)", tensors.len(), first.join(", "))
     };
-    Error::new(ErrorCode::Unsupported, "", message)
-        .with_help(format!("supported are checkpoints of {} (2021); --system names one", System::names()))
+    Error::new(ErrorCode::Unsupported, "", message).with_help(format!(
+        "supported are checkpoints of {} (versions up to 2021); --system names one",
+        System::names()
+    ))
 }
 
 #[cfg(test)]
@@ -274,8 +276,8 @@ mod tests {
         assert_eq!(
             error.to_string(),
             "m.pth: the tensor names are of no known system (2 tensors: fc.bias, fc.weight, …)\n  \
-             help: supported are checkpoints of aim, late_fusion, transfuser, geometric_fusion, cilrs, lbc (2021); \
-             --system names one"
+             help: supported are checkpoints of aim, late_fusion, transfuser, geometric_fusion, cilrs, lbc \
+             (versions up to 2021); --system names one"
         );
     }
 

@@ -231,8 +231,8 @@ fn channels_last(maps: &[u8], i: usize, channels: usize) -> Vec<f32> {
 #[derive(Clone, Debug)]
 pub struct Expected {
     /// Result to its values per frame: `waypoints` are `[right, forward-negative]`, m; of CILRS `steer`, `throttle`,
-    /// `brake` and `velocity`; of LBC `points`, `[x, y]` from −1 to 1, and mean and standard deviation over all pixels of
-    /// each map of logits, `logits_mean` and `logits_std` (temperature 5, without `hack`).
+    /// `brake` and `velocity`; of LBC `points`, `[x, y]` from −1 to 1, and mean and standard deviation over all pixels
+    /// of each map of logits, `logits_mean` and `logits_std` (temperature 5, without `hack`).
     pub results: BTreeMap<String, Vec<Vec<f32>>>,
     /// Module name to spatial mean per frame and channel (of a transformer: of its image tokens' part).
     pub taps: BTreeMap<String, Vec<Vec<f32>>>,

@@ -1,6 +1,6 @@
 //! Ready network inputs in a `.safetensors` file: `rgb` u8 `[N,3,H,W]`, `bev` u8 `[N,2,H,W]` (counts 0..=5), `velocity`
-//! f32 `[N]`, `target` f32 `[N,2]` (network frame), `lbc_input` f32 `[N,10,H,W]` (views and heatmap, 0..=1), `command` i32
-//! `[N]` (1..=6), `bev_points` and `cam_points` i32 `[N,H,W,K,2]` (cells that see the same points).
+//! f32 `[N]`, `target` f32 `[N,2]` (network frame), `lbc_input` f32 `[N,10,H,W]` (views and heatmap, 0..=1), `command`
+//! i32 `[N]` (1..=6), `bev_points` and `cam_points` i32 `[N,H,W,K,2]` (cells that see the same points).
 //!
 //! Of a classifier: the image by the network's own name for it, or as `rgb`, `[N,C,H,W]`, and optionally `label` i64
 //! `[N]`. Images may be f32 as well; they are raw, so every value is a whole number 0..=255.
