@@ -14,12 +14,12 @@ use model_compiler::frames::Frame;
 use model_compiler::import::{ImportOptions, System, import};
 use model_compiler::ir::Graph;
 use model_compiler::passes::optimize;
-use model_compiler::pipeline::Compiled;
+use model_compiler::pipeline::{self, Compiled};
 use model_compiler::qmodel::QModel;
 use model_compiler::quantize::{QuantizeOptions, SkipStages};
 use std::collections::BTreeMap;
 use tests::build;
-use tests::golden::{self, Network};
+use tests::golden::{self, Lbc, Network};
 
 const SYSTEMS: [System; 5] =
     [System::Aim, System::LateFusion, System::TransFuser, System::GeometricFusion, System::Cilrs];
@@ -47,22 +47,42 @@ fn quantized(graph: &Graph, skip: SkipStages) -> QModel {
     build::quantized(graph, &QuantizeOptions { skip, ..Default::default() })
 }
 
-#[test]
-fn small_networks_are_byte_exact() {
-    for system in SYSTEMS {
-        let network = Network::small(system);
-        let graph = build::small(&network);
-        for skip in [SkipStages::narrow(), SkipStages::wide()] {
-            let model = quantized(&graph, skip);
-            for target in ["portable", "x86"] {
-                let compiled = build::compiled_for(&model, target);
-                for backend in Backend::all() {
-                    assert_byte_exact(&compiled, &build::frames_of(&graph), backend);
-                }
-                assert_self_test_passes(&compiled);
+/// Both types of skip values, for both targets, on every backend.
+fn assert_byte_exact_everywhere(graph: &Graph) {
+    for skip in [SkipStages::narrow(), SkipStages::wide()] {
+        let model = quantized(graph, skip);
+        for target in ["portable", "x86"] {
+            let compiled = build::compiled_for(&model, target);
+            for backend in Backend::all() {
+                assert_byte_exact(&compiled, &build::frames_of(graph), backend);
             }
+            assert_self_test_passes(&compiled);
         }
     }
+}
+
+#[test]
+fn small_networks_are_byte_exact() {
+    SYSTEMS.into_iter().for_each(|system| assert_byte_exact_everywhere(&build::small(&Network::small(system))));
+}
+
+#[test]
+fn small_lbc_is_byte_exact() {
+    [false, true].into_iter().for_each(|hack| assert_byte_exact_everywhere(&build::lbc(&Lbc::small(), hack)));
+}
+
+/// At half the resolution, which is a quarter of the work.
+#[test]
+fn full_size_lbc_is_byte_exact() {
+    let options = ImportOptions { hack: true, ..Default::default() };
+    let mut graph = import("lbc", golden::checkpoint(System::Lbc), &options).unwrap_or_else(|e| panic!("{e}"));
+    optimize(&mut graph).unwrap_or_else(|e| panic!("{e}"));
+    let calibration = &build::frames_of(&graph)[..1];
+    let quantize = QuantizeOptions::default();
+    let model = pipeline::quantize_graph(&graph, calibration, &quantize, &mut |_, _, _| {});
+    let compiled = build::compiled_for(&model.unwrap_or_else(|e| panic!("{e}")), "x86");
+    let fastest = Backend::choose(None).unwrap_or_else(|e| panic!("{e}"));
+    assert_byte_exact(&compiled, calibration, fastest);
 }
 
 #[test]

@@ -187,7 +187,14 @@ fn wrappers_and_what_lies_beside_are_passed_over() {
             ),
             ("optimizer_states", Py::List(vec![Py::dict([("lr", Py::Float(1e-4)), ("none", Py::None)])])),
             ("state_dict", weights),
-            ("hyper_parameters", Py::Call("argparse", "Namespace", vec![])),
+            (
+                "hyper_parameters",
+                Py::dict([
+                    ("hack", Py::Bool(true)),
+                    ("dataset_dir", Py::Call("pathlib", "PosixPath", vec![Py::str("/"), Py::str("data")])),
+                    ("more", Py::Call("argparse", "Namespace", vec![])),
+                ]),
+            ),
         ])
     });
     let wrap = |key| small().wrap(|weights| Py::dict([("best_prec1", Py::Float(91.8)), (key, weights)]));

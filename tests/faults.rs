@@ -25,7 +25,8 @@ fn expected_operators(fault: Fault) -> &'static [&'static str] {
         Fault::ResidualZeroPoint => &["conv2d", "linear", "add", "resize_bilinear"],
         Fault::GateOrder | Fault::ResetBeforeBias | Fault::GoalFirstStepOnly => &["waypoint_decoder"],
         Fault::TanhNextEntry => &["waypoint_decoder", "sigmoid"],
-        Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention", "softmax"],
+        Fault::ExpNextEntry | Fault::SoftmaxMaximum => &["attention", "softmax", "spatial_softmax"],
+        Fault::PointAxes => &["spatial_softmax"],
         Fault::LayerNormEpsilon => &["layer_norm"],
         Fault::DepthTail | Fault::MultiplierPlusOne | Fault::ChannelsSwapped => WEIGHTED,
         // Where the bytes in front of the scratch belong to an operand of the same step, the engine refuses to cut

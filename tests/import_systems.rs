@@ -5,7 +5,8 @@ use model_compiler::import::{ImportOptions, NamedTensor, NamedTensors, System, T
 use model_compiler::ir::verify::verify;
 use model_compiler::ir::{Clip, Graph, InputKind, Op, Shape};
 use model_compiler::passes::{PassOptions, optimize, optimize_with};
-use tests::golden::{self, Network};
+use model_compiler::reference;
+use tests::golden::{self, Lbc, Network};
 
 fn import_default(tensors: NamedTensors) -> Graph {
     let graph = import("model", tensors, &ImportOptions::default()).unwrap_or_else(|e| panic!("{e}"));
@@ -81,6 +82,85 @@ fn parts_of_transfuser_cost_what_the_specification_says() {
         ("waypoints", 0.05),
     ] {
         assert_eq!(mega_macs(&graph, prefix), expected, "{prefix}");
+    }
+}
+
+#[test]
+fn published_lbc_has_the_published_size_at_both_resolutions() {
+    for (hack, giga_macs, last) in [(false, 23.20, (18, 32)), (true, 5.80, (9, 16))] {
+        let options = ImportOptions { hack, ..Default::default() };
+        let mut graph = import("lbc.ckpt", golden::checkpoint(System::Lbc), &options).unwrap();
+        assert_eq!((graph.system.as_str(), graph.parameters()), ("lbc", 39_656_472));
+        for _ in 0..2 {
+            assert_eq!(verify(&graph), Ok(()));
+            assert_eq!(shape_of(&graph, "views"), Shape::map(144, 256, 10));
+            let head = shape_of(&graph, "net.network.classifier.4");
+            assert_eq!(head, Shape::map(last.0, last.1, 4));
+            assert_eq!(shape_of(&graph, if hack { "net.upsample" } else { "net.network" }), Shape::map(144, 256, 4));
+            assert_eq!(shape_of(&graph, "points"), Shape::tokens(4, 2));
+            assert_eq!((graph.macs() as f64 / 1e7).round() / 1e2, giga_macs);
+            optimize(&mut graph).unwrap();
+        }
+        assert_eq!((count(&graph, "conv2d"), count(&graph, "batch_norm"), count(&graph, "relu")), (61, 0, 0));
+    }
+}
+
+#[test]
+fn sizes_of_lbc_come_from_the_tensors_and_prefixes_are_free() {
+    let network = Lbc::small();
+    let options = ImportOptions { resolution: Some((48, 64)), temperature: Some(2.5), ..Default::default() };
+    for wrapper in ["", "net.", "model.net."] {
+        let mut tensors = NamedTensors::default();
+        for (name, tensor) in network.tensors().iter() {
+            tensors.insert(format!("{wrapper}{}", name.strip_prefix("net.").unwrap()), tensor.clone());
+        }
+        let outer = wrapper.strip_suffix("net.").unwrap_or_default();
+        for unused in ["to_heatmap.kernel", "converter.position", "controller.layers.1.weight", "teacher.net.norm.bias"]
+        {
+            tensors.insert(format!("{outer}{unused}"), floats(&[2, 2]));
+        }
+        let graph = import("small.ckpt", tensors, &options).unwrap();
+        let backbone = format!("{wrapper}network.backbone");
+        assert_eq!(shape_of(&graph, &format!("{backbone}.layer1.0")), Shape::map(12, 16, 12));
+        assert_eq!(shape_of(&graph, &format!("{backbone}.layer2.1")), Shape::map(6, 8, 16));
+        assert_eq!(shape_of(&graph, &format!("{backbone}.layer4.1")), Shape::map(6, 8, 20));
+        assert!(graph.find(&format!("{backbone}.layer3.0.downsample.0")).is_none(), "the identity fits");
+        assert_eq!(shape_of(&graph, "points"), Shape::tokens(3, 2));
+        let dilations = |module: &str| match &graph.producer(graph.find(module).unwrap()).unwrap().op {
+            Op::Conv2d(conv) => (conv.window.dilation_h, conv.window.pad_top, conv.window.stride_h),
+            op => panic!("{module} is a {}", op.name()),
+        };
+        for (module, expected) in [
+            ("layer2.0.conv2", (1, 1, 2)),
+            ("layer3.0.conv2", (1, 1, 1)),
+            ("layer3.1.conv2", (2, 2, 1)),
+            ("layer4.0.conv2", (2, 2, 1)),
+            ("layer4.1.conv2", (4, 4, 1)),
+        ] {
+            assert_eq!(dilations(&format!("{backbone}.{module}")), expected, "{module}");
+        }
+        let last = graph.producer(graph.outputs[0]).unwrap();
+        assert!(matches!(last.op, Op::SpatialSoftmax { temperature: 2.5 }));
+    }
+}
+
+#[test]
+fn the_batch_norm_of_the_views_is_folded_or_lowered() {
+    let options = ImportOptions { resolution: Some((48, 64)), ..Default::default() };
+    for (dead, operators) in [(false, 0), (true, 1)] {
+        let mut tensors = Lbc::small().tensors();
+        // In the middle of the grey levels, so that padding has a code; negative gains are folded, too.
+        spoil(&mut tensors, "net.norm.running_mean", |v| v.fill(0.5));
+        spoil(&mut tensors, "net.norm.weight", |v| v[4] = if dead { 0.0 } else { -1.0 });
+        let mut graph = import("small", tensors, &options).unwrap();
+        let frame = vec![tests::build::views((48, 64))[0].raw(InputKind::Views).unwrap()];
+        let before = reference::run(&graph, &frame, |_, _| ()).unwrap().remove(0);
+        optimize(&mut graph).unwrap();
+        let after = reference::run(&graph, &frame, |_, _| ()).unwrap().remove(0);
+        let worst = before.iter().zip(&after).map(|(b, a)| (b - a).abs()).fold(0.0, f32::max);
+        assert!(worst < 1e-3, "{worst} pixels apart");
+        let alone = graph.nodes.iter().filter(|n| matches!(&n.op, Op::Conv2d(c) if c.groups == 10)).count();
+        assert_eq!(alone, operators);
     }
 }
 
@@ -438,6 +518,40 @@ fn unfitting_options_are_refused_by_name() {
         "m: an input of 64×96 pixels is not square\n  \
          help: this network takes columns of the image for rows, so it needs as many of both"
     );
+}
+
+#[test]
+fn options_of_lbc_are_refused_where_they_do_not_fit() {
+    let refused = |tensors, options: ImportOptions| import("m", tensors, &options).unwrap_err().to_string();
+    let hack = ImportOptions { hack: true, ..Default::default() };
+    assert_eq!(
+        refused(Network::small(System::Aim).tensors(), hack.clone()),
+        "m: --hack and --temperature have no effect on aim\n  help: leave them out; they belong to lbc"
+    );
+    let temperature = ImportOptions { temperature: Some(1.0), ..Default::default() };
+    assert!(
+        refused(Network::small(System::TransFuser).tensors(), temperature).contains("--temperature have no effect")
+    );
+    let halves = ImportOptions { resolution: Some((56, 64)), ..hack };
+    assert_eq!(
+        refused(Lbc::small().tensors(), halves.clone()),
+        "m: an input of 56×64 pixels does not divide into the network's last map\n  \
+         help: height and width must be multiples of 16 pixels"
+    );
+    import("m", Lbc::small().tensors(), &ImportOptions { hack: false, ..halves }).unwrap();
+    let mut tensors = Lbc::small().tensors();
+    tensors.remove("net.network.classifier.0.project.1.bias");
+    tensors.insert("net.network.classifier.4.bias", floats(&[2]));
+    tensors.insert("net.network.classifier.5.bias", floats(&[5]));
+    let text = refused(tensors, ImportOptions::default());
+    assert!(text.starts_with("m: 3 tensors do not fit the system lbc:\n"), "{text}");
+    for line in [
+        "net.network.classifier.0.project.1.bias  missing    expected [10]",
+        "net.network.classifier.4.bias            found [2]  expected [3]",
+        "net.network.classifier.5.bias            found [5]  surplus",
+    ] {
+        assert!(text.contains(line), "{text}");
+    }
 }
 
 #[test]

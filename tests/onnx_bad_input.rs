@@ -213,6 +213,8 @@ fn options_that_do_not_fit() {
             " --fusion-scales 4",
             "@net.onnx: --fusion-scales has no effect on an ONNX file\n  help: leave --fusion-scales out",
         ),
+        (" --hack", "@net.onnx: --hack has no effect on an ONNX file\n  help: leave --hack out"),
+        (" --temperature 1", "@net.onnx: --temperature has no effect on an ONNX file\n  help: leave --temperature out"),
         (" --heads 4", "@net.onnx: --heads has no effect on an ONNX file\n  help: leave --heads out"),
         (
             " --mean 1,2 --std 1",

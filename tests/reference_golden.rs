@@ -1,15 +1,18 @@
-//! The f32 reference meets what the original networks gave: waypoints or controls and the means of inner features, at
-//! full size, for the graph as imported and as optimized.
+//! The f32 reference meets what the original networks gave: waypoints, controls or points (with the statistics of their
+//! logits) and the means of inner features, at full size, for the graph as imported and as optimized.
 
 use host_sim::controls::ControlOutputs;
+use host_sim::points::{self, PixelGrid};
 use host_sim::statistics::ErrorSums;
 use model_compiler::import::{ImportOptions, System, import};
 use model_compiler::ir::{Graph, InputKind, ValueId};
 use model_compiler::{passes, reference};
 use std::collections::BTreeMap;
+use tests::build;
+use tests::commands::{self, Folder};
 use tests::golden::{self, Expected, Frame};
 
-/// Meters, m/s, or of a control.
+/// Meters, m/s, of a control, of a point's −1..1, or of logits of order 1.
 const RESULT_TOLERANCE: f32 = 1e-3;
 
 /// Of the expected mean, or of [`TAP_FLOOR`] times the largest mean of the same tap and frame where that is more: a
@@ -26,6 +29,7 @@ fn raw_inputs(graph: &Graph, frame: &Frame) -> Vec<Vec<f32>> {
         InputKind::BevPoints => frame.bev_points.clone(),
         InputKind::CameraPoints => frame.camera_points.clone(),
         InputKind::Command => vec![frame.command as f32],
+        InputKind::Views => frame.views.clone(),
     };
     graph.inputs().map(|(_, kind)| raw(kind)).collect()
 }
@@ -45,13 +49,37 @@ fn tap_error(found: &[f32], expected: &[f32]) -> f32 {
     errors.fold(0.0, |worst, e| if e > worst || e.is_nan() { e } else { worst })
 }
 
+fn largest_error(found: &[f32], expected: &[f32]) -> f32 {
+    assert_eq!(found.len(), expected.len());
+    let mut errors = ErrorSums::default();
+    errors.add(expected, found);
+    errors.largest_error() as f32
+}
+
 /// False for an error that is not a number.
 fn within(error: f32, tolerance: f32) -> bool {
     error <= tolerance
 }
 
-/// The outputs of a graph under the names of the stored results.
-fn results(graph: &Graph, outputs: &[Vec<f32>]) -> Vec<(&'static str, Vec<f32>)> {
+/// Mean and standard deviation over all positions, per channel.
+fn statistics(map: &[f32], channels: usize) -> [Vec<f32>; 2] {
+    let mean = spatial_mean(map, channels);
+    let deviation = |c: usize| {
+        let squares = map.iter().skip(c).step_by(channels).map(|&x| (f64::from(x) - f64::from(mean[c])).powi(2));
+        (squares.sum::<f64>() / ((map.len() / channels) as f64 - 1.0)).sqrt() as f32
+    };
+    let deviation = (0..channels).map(deviation).collect();
+    [mean, deviation]
+}
+
+/// What a graph gives, under the names of the stored results. `logits`: what its points are made of.
+fn results(graph: &Graph, outputs: &[Vec<f32>], logits: &[f32]) -> Vec<(&'static str, Vec<f32>)> {
+    if let Some(grid) = PixelGrid::of_graph(graph) {
+        let points = grid.points(&outputs[0]);
+        let [mean, deviation] = statistics(logits, points.len());
+        let points = points.as_flattened().iter().map(|&v| v as f32).collect();
+        return vec![("points", points), ("logits_mean", mean), ("logits_std", deviation)];
+    }
     let names = graph.outputs.iter().map(|&id| graph.value(id).name.as_str());
     let Some(controls) = ControlOutputs::find(names) else { return vec![("waypoints", outputs[0].clone())] };
     let prediction = controls.read(outputs).expect("three controls");
@@ -71,8 +99,11 @@ fn check(what: &str, graph: &Graph, frames: &[Frame], expected: &Expected) {
     let mut misses = Vec::new();
     let (mut worst_tap, mut worst_result) = (0.0_f32, 0.0_f32);
     for (i, frame) in frames.iter().enumerate() {
-        let mut seen = 0;
+        let (mut seen, mut logits) = (0, Vec::new());
         let outputs = reference::run(graph, &raw_inputs(graph, frame), |node, map| {
+            if points::logits(graph) == Some(node.output) {
+                logits = map.to_vec();
+            }
             let Some(module) = taps.get(&node.output) else { return };
             let means = spatial_mean(map, usize::from(graph.value(node.output).shape.channels));
             let error = tap_error(&means, &expected.taps[*module][i]);
@@ -84,13 +115,11 @@ fn check(what: &str, graph: &Graph, frames: &[Frame], expected: &Expected) {
         })
         .unwrap_or_else(|e| panic!("{what}: {e}"));
         assert_eq!(seen, expected.taps.len(), "{what}: every tap is computed");
-        let found = results(graph, &outputs);
+        let found = results(graph, &outputs, &logits);
         assert_eq!(found.len(), expected.results.len(), "{what}: every result is computed");
         for (name, found) in found {
             let result = &expected.results[name][i];
-            let mut errors = ErrorSums::default();
-            errors.add(result, &found);
-            let error = errors.largest_error() as f32;
+            let error = largest_error(&found, result);
             worst_result = worst_result.max(error);
             if !within(error, RESULT_TOLERANCE) {
                 misses.push(format!("frame {i}: {name} {found:?}, expected {result:?}"));
@@ -132,4 +161,27 @@ fn geometric_fusion_meets_the_original() {
 #[test]
 fn cilrs_meets_the_original() {
     meets_the_original(System::Cilrs);
+}
+
+#[test]
+fn lbc_meets_the_original() {
+    meets_the_original(System::Lbc);
+}
+
+/// The same through the command line, from files.
+#[test]
+fn lbc_meets_the_original_through_host_sim() {
+    let folder = Folder::default();
+    golden::write_safetensors(&golden::checkpoint(System::Lbc), &folder.path("lbc.safetensors")).unwrap();
+    folder.write("inputs.safetensors", commands::views_file(&build::views((144, 256))));
+    let (status, report) =
+        folder.json("host-sim run @lbc.safetensors --inputs @inputs.safetensors --frames-limit 2 --json");
+    assert_eq!(status, 0);
+    for (i, expected) in golden::expected(System::Lbc).results["points"].iter().take(2).enumerate() {
+        let points = report["frames"][i]["points"].as_array().expect("points");
+        let values = points.iter().flat_map(|point| point.as_array().expect("a pair")).filter_map(|v| v.as_f64());
+        let points: Vec<f32> = values.map(|v| v as f32).collect();
+        let error = largest_error(&points, expected);
+        assert!(within(error, RESULT_TOLERANCE), "frame {i}: {points:?}, expected {expected:?}");
+    }
 }

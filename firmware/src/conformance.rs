@@ -82,7 +82,7 @@ struct Difference {
 }
 
 /// Every operator of the image format that has a kernel (a branch linear layer runs that of a linear layer).
-const OPERATORS: [Operator; 17] = [
+const OPERATORS: [Operator; 18] = [
     Operator { name: "conv2d", cases: 3000, run: weighted::conv2d },
     Operator { name: "linear", cases: 3000, run: weighted::linear },
     Operator { name: "max_pool", cases: 1000, run: maps::max_pool },
@@ -100,6 +100,7 @@ const OPERATORS: [Operator; 17] = [
     Operator { name: "softmax", cases: 600, run: tokens::softmax },
     Operator { name: "gather_sum", cases: 600, run: maps::gather_sum },
     Operator { name: "sigmoid", cases: 600, run: tokens::sigmoid },
+    Operator { name: "spatial_softmax", cases: 300, run: tokens::spatial_softmax },
 ];
 
 /// Compares a backend with [`Portable`]. `workspace`: [`WORKSPACE_BYTES`]; what does not fit in a smaller one is left out

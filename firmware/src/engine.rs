@@ -243,13 +243,14 @@ impl<'a, K: Kernels> Engine<'a, K> {
     /// The waypoints of an output, after [`Progress::Done`].
     ///
     /// # Errors
-    /// As [`Self::output`]; [`EngineError::NoWaypoints`] where the output holds something else.
+    /// As [`Self::output`]; [`EngineError::NoWaypoints`] where the output holds something else than pairs of Q16 meters.
     pub fn waypoints(&self, output: usize) -> Result<heapless::Vec<Waypoint, MAX_WAYPOINTS>, EngineError> {
         let bytes = self.output(output)?;
         let number = u8::try_from(output).unwrap_or(u8::MAX);
-        let record = self.image.output(number).and_then(|port| self.image.tensor(port.tensor));
-        let is_points = record.is_some_and(|r| r.element == ElementType::I32 && r.shape.channels == 2);
-        waypoint::read(bytes).filter(|_| is_points).ok_or(EngineError::NoWaypoints(number))
+        let port = self.image.output(number).filter(|port| port.scale.to_bits() == waypoint::SCALE_BITS);
+        let record = port.and_then(|port| self.image.tensor(port.tensor));
+        let is_waypoints = record.is_some_and(|r| r.element == ElementType::I32 && r.shape.channels == 2);
+        waypoint::read(bytes).filter(|_| is_waypoints).ok_or(EngineError::NoWaypoints(number))
     }
 
     /// The arena, for tests of the memory plan (poison in dead bytes must not change any output). Whatever is written

@@ -42,7 +42,7 @@ pub enum Fault {
     MultiplierPlusOne,
     /// The weights of output channels 0 and 1 are swapped.
     ChannelsSwapped,
-    /// The softmax maximum skips the last key (of attention) or channel.
+    /// The softmax maximum skips the last key (of attention), channel or pixel.
     SoftmaxMaximum,
     /// Resize uses the weights of its two rows the wrong way round.
     ResizeWeights,
@@ -64,11 +64,13 @@ pub enum Fault {
     GatherTransposed,
     /// Commands count from 0: the block behind the chosen one is used.
     BranchFromZero,
+    /// Column and row of a spatial softmax's points are exchanged.
+    PointAxes,
 }
 
 impl Fault {
     /// All faults, for tests and `--fault NAME`.
-    pub const ALL: [Fault; 28] = [
+    pub const ALL: [Fault; 29] = [
         Self::TieDown,
         Self::TieAwayFromZero,
         Self::DoubleRounding,
@@ -97,6 +99,7 @@ impl Fault {
         Self::ConcatOrder,
         Self::GatherTransposed,
         Self::BranchFromZero,
+        Self::PointAxes,
     ];
 }
 

@@ -146,13 +146,25 @@ pub const fn divide(numerator: u64, denominator: u64) -> u64 {
 /// Precondition: 0 ≤ u ≤ [`EXPONENT_MAX`] (other values are moved there).
 #[inline]
 pub fn exp2_q15(table: &[i16; EXP_TABLE_LEN], exponent: i64) -> i16 {
+    saturate_i16(exp2(table, exponent, 8))
+}
+
+/// `2^(−u/2^16)` in Q23: `R((T[k]<<8) − (T[k] − T[k+1])·r, I)`; see [`exp2_q15`].
+#[inline]
+pub fn exp2_q23(table: &[i16; EXP_TABLE_LEN], exponent: i64) -> i64 {
+    exp2(table, exponent, 0)
+}
+
+/// `2^(−u/2^16)` in Q23, rounded with the last `drop` bits left off.
+#[inline]
+fn exp2(table: &[i16; EXP_TABLE_LEN], exponent: i64, drop: u64) -> i64 {
     let exponent = exponent.clamp(0, EXPONENT_MAX);
     let k = low_bits(exponent >> 8, 8);
     let fraction = exponent & 255;
-    let shift = 8 + (exponent >> 16).unsigned_abs().min(23);
+    let shift = (drop + (exponent >> 16).unsigned_abs()).min(31);
     let here = i64::from(table[k]);
     let next = i64::from(table[if fault::active(Fault::ExpNextEntry) { k } else { k + 1 }]);
-    saturate_i16(round_shift((here << 8) - (here - next) * fraction, u32::try_from(shift).unwrap_or(31)))
+    round_shift((here << 8) - (here - next) * fraction, u32::try_from(shift).unwrap_or(31))
 }
 
 /// `tanh(x)` in Q15 of `x` in Q12, from `T[k] = min(32767, round(2^15·tanh(k/64)))`.
@@ -315,6 +327,22 @@ mod tests {
         }
         assert_eq!(exp2_q15(&table, 0), 32767);
         assert_eq!(exp2_q15(&table, EXPONENT_MAX), 0);
+    }
+
+    #[test]
+    fn exp2_of_23_bits_keeps_what_15_bits_round_away() {
+        let table = exp_table();
+        for u in 0..=EXPONENT_MAX {
+            let (i, k, r) = ((u >> 16) as u32, ((u >> 8) & 255) as usize, u & 255);
+            let (here, next) = (i128::from(table[k]), i128::from(table[k + 1]));
+            let expected = ((here << 8) - (here - next) * i128::from(r) + ((1 << i) >> 1)) >> i;
+            assert_eq!(i128::from(exp2_q23(&table, u)), expected, "u = {u}");
+            let real = f64::exp2(23.0 - u as f64 / 65536.0);
+            assert!((expected as f64 - real).abs() < 0.51 + 5e-5 * real, "u = {u}: {expected} against {real}");
+        }
+        assert_eq!(exp2_q23(&table, 0), 32767 << 8);
+        assert_eq!(exp2_q23(&table, 22 << 16), 2);
+        assert_eq!([24 << 16, EXPONENT_MAX, i64::MAX].map(|u| exp2_q23(&table, u)), [0; 3], "far pixels add nothing");
     }
 
     #[test]

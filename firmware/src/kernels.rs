@@ -314,6 +314,17 @@ pub struct SigmoidArgs<'a> {
     pub tanh_table: &'a [i16],
 }
 
+/// Arguments of [`Kernels::spatial_softmax`].
+#[derive(Clone, Copy, Debug)]
+pub struct SpatialSoftmaxArgs<'a> {
+    /// Shape of the logits.
+    pub shape: Shape,
+    /// `M_u`, `n_u`.
+    pub exponent: Requant,
+    /// 257 entries.
+    pub exp_table: &'a [i16],
+}
+
 /// One method per operator (branches of linear layers run [`Self::linear`]); see the module page. Operand layouts are
 /// those of [`crate::tensor`].
 pub trait Kernels {
@@ -421,6 +432,11 @@ pub trait Kernels {
     fn sigmoid(&self, args: &SigmoidArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
         portable::sigmoid::sigmoid(args, input, output);
     }
+
+    /// Expected pixel per channel. `points`: `[column, row]` of each channel, in 1/64 pixel.
+    fn spatial_softmax(&self, args: &SpatialSoftmaxArgs<'_>, input: &[i16], points: &mut [i32]) {
+        portable::spatial_softmax::spatial_softmax(args, input, points);
+    }
 }
 
 /// A borrowed backend is one: every method goes to the backend behind the reference.
@@ -510,6 +526,10 @@ impl<K: Kernels + ?Sized> Kernels for &K {
 
     fn sigmoid(&self, args: &SigmoidArgs<'_>, input: Option<Codes<'_>>, output: &mut [i16]) {
         (**self).sigmoid(args, input, output);
+    }
+
+    fn spatial_softmax(&self, args: &SpatialSoftmaxArgs<'_>, input: &[i16], points: &mut [i32]) {
+        (**self).spatial_softmax(args, input, points);
     }
 }
 

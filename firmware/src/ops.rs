@@ -41,6 +41,7 @@ mod rescale;
 mod resize_bilinear;
 mod sigmoid;
 mod softmax;
+mod spatial_softmax;
 mod term;
 mod tokens;
 mod waypoint_decoder;
@@ -69,6 +70,7 @@ pub(crate) fn validate(step: &Step, context: &StepContext<'_, '_>) -> Result<u64
         Step::GatherSum(step) => gather_sum::validate(step, context),
         Step::BranchLinear(step) => branch_linear::validate(step, context),
         Step::Sigmoid(step) => sigmoid::validate(step, context),
+        Step::SpatialSoftmax(step) => spatial_softmax::validate(step, context),
     }
 }
 
@@ -103,6 +105,7 @@ pub(crate) fn run<K: Kernels>(
         Step::GatherSum(step) => gather_sum::run(step, &context, kernels, operands),
         Step::BranchLinear(step) => branch_linear::run(step, &context, kernels, operands),
         Step::Sigmoid(step) => sigmoid::run(step, &context, kernels, operands),
+        Step::SpatialSoftmax(step) => spatial_softmax::run(step, &context, kernels, operands),
     }
 }
 

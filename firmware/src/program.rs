@@ -570,6 +570,25 @@ pub struct Sigmoid {
     pub tanh_table: ConstRange,
 }
 
+/// Expected pixel of each channel's map under a softmax over all pixels: for channel k, with `δ_j = max(q_k) − q_jk`,
+/// `u_j = min(R(δ_j·M_u, n_u), 31·2^16)`, `I = u>>16`, `i = (u>>8)&255`, `r = u&255`:
+///
+/// `e_j = R((T[i]<<8) − (T[i]−T[i+1])·r, I)` (Q23); `column = floor(2^6·Σ e_j·column_j / Σ e_j)`, `row` alike.
+///
+/// No probability is formed: Q15 is too coarse where thousands of faint pixels outweigh the peak. At most 256 rows and
+/// columns: then `Σ e_j < 2^39` and `2^6·Σ e_j·column_j < 2^53`.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SpatialSoftmax {
+    /// i16 map of logits `H×W×K`, H and W at most 256.
+    pub input: TensorId,
+    /// i32 points `K×1×2`, `[column, row]` in 1/64 pixel from the center of the first pixel.
+    pub output: TensorId,
+    /// `M_u`, `n_u`, of `s_x·log2(e)/temperature·2^16`.
+    pub exponent: Requant,
+    /// 257 × `i16`: `T[k] = min(32767, round(2^15·2^(−k/256)))`.
+    pub exp_table: ConstRange,
+}
+
 /// One operator of the program, in the order of execution.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant, reason = "decoded one at a time on the stack, never stored in bulk on the target")]
@@ -593,6 +612,7 @@ pub enum Step {
     GatherSum(GatherSum),
     BranchLinear(BranchLinear),
     Sigmoid(Sigmoid),
+    SpatialSoftmax(SpatialSoftmax),
 }
 
 impl Rescale {
@@ -607,7 +627,7 @@ impl Rescale {
 
 impl Step {
     /// Union of the feature bits of all step kinds and kernels of this format.
-    pub const KNOWN_FEATURES: u64 = ((1 << 18) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
+    pub const KNOWN_FEATURES: u64 = ((1 << 19) - 1) | KernelId::Direct.feature() | KernelId::K4N16.feature();
 
     /// Operator name as reports print it.
     pub const fn name(&self) -> &'static str {
@@ -630,6 +650,7 @@ impl Step {
             Self::GatherSum(_) => "gather_sum",
             Self::BranchLinear(_) => "branch_linear",
             Self::Sigmoid(_) => "sigmoid",
+            Self::SpatialSoftmax(_) => "spatial_softmax",
         }
     }
 
@@ -654,6 +675,7 @@ impl Step {
             Self::GatherSum(_) => 15,
             Self::BranchLinear(_) => 16,
             Self::Sigmoid(_) => 17,
+            Self::SpatialSoftmax(_) => 18,
         }
     }
 
@@ -678,6 +700,7 @@ impl Step {
             Self::GatherSum(s) => s.output,
             Self::BranchLinear(s) => s.output,
             Self::Sigmoid(s) => s.output,
+            Self::SpatialSoftmax(s) => s.output,
         }
     }
 
@@ -724,6 +747,7 @@ impl Step {
             Self::GatherSum(s) => [Some(s.input), Some(s.indices), None],
             Self::BranchLinear(s) => [Some(s.input), Some(s.command), None],
             Self::Sigmoid(s) => [Some(s.input), None, None],
+            Self::SpatialSoftmax(s) => [Some(s.input), None, None],
         }
     }
 

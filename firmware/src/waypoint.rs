@@ -6,6 +6,9 @@ use heapless::Vec;
 /// Most waypoints of one output; the published networks give 4.
 pub const MAX_WAYPOINTS: usize = 16;
 
+/// Bits of the scale, `2^-16`, that tells waypoints from other pairs of words, such as points of an image.
+pub(crate) const SCALE_BITS: u32 = (1.0_f32 / 65536.0).to_bits();
+
 /// Where to be, half a second after the waypoint before (the first: half a second from now), in the vehicle's frame.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Waypoint {

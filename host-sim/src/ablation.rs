@@ -5,6 +5,7 @@
 use crate::classification::{ClassificationSummary, Comparison};
 use crate::controls::{ControlComparison, ControlError, ControlOutputs};
 use crate::files::FrameSource;
+use crate::points;
 use crate::statistics::{ErrorSums, Spread};
 use crate::trace::input_codes;
 use indicatif::ProgressBar;
@@ -36,7 +37,8 @@ pub struct Variant {
 /// What a variant reaches over all evaluation frames.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fidelity {
-    /// SQNR of the pooled global vector (of the first output where nothing is pooled), dB: power sums over all frames.
+    /// SQNR of the pooled global vector (of the logits of points; of the first output where nothing is pooled), dB:
+    /// power sums over all frames.
     pub vector_sqnr_db: f64,
     /// Mean distance from the f32 waypoint, per waypoint, millimeters.
     pub mean_mm: Vec<f64>,
@@ -45,9 +47,21 @@ pub struct Fidelity {
     /// Of a network that gives controls: distance of each from the f32 network's.
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub controls: Vec<ControlError>,
+    /// Of points: distances from those of f32.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub points: Option<PointFidelity>,
     /// Of a classifier: SQNR of the logits, agreement with f32, accuracy.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub classes: Option<ClassificationSummary>,
+}
+
+/// Distances from the f32 point, per point, pixels.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PointFidelity {
+    /// Mean.
+    pub mean_px: Vec<f64>,
+    /// Largest.
+    pub worst_px: Vec<f64>,
 }
 
 /// The default with 8-bit and with 16-bit skip values, and the former without one choice each.
@@ -195,18 +209,23 @@ impl<'a> Bench<'a> {
                 distances.resize(output.len() / 2, Spread::default());
                 let pairs = expected_output.chunks_exact(2).zip(output.chunks_exact(2));
                 for ((e, f), distance) in pairs.zip(&mut distances) {
-                    distance.add(1e3 * f64::from(e[0] - f[0]).hypot(f64::from(e[1] - f[1])));
+                    distance.add(f64::from(e[0] - f[0]).hypot(f64::from(e[1] - f[1])));
                 }
             }
             progress(index + 1);
         }
-        Ok(Fidelity {
-            vector_sqnr_db: vectors.sqnr_db(),
-            mean_mm: distances.iter().map(Spread::mean).collect(),
-            worst_mm: distances.iter().map(Spread::max).collect(),
-            controls: controls.summary(),
-            classes: classes.summary(),
-        })
+        // Waypoints are in meters, points in pixels.
+        let gives_points = points::logits(&self.graph).is_some();
+        let unit = if gives_points { 1.0 } else { 1e3 };
+        let mean: Vec<f64> = distances.iter().map(|distance| unit * distance.mean()).collect();
+        let worst: Vec<f64> = distances.iter().map(|distance| unit * distance.max()).collect();
+        let (of_waypoints, points) = match gives_points {
+            true => ([vec![], vec![]], Some(PointFidelity { mean_px: mean, worst_px: worst })),
+            false => ([mean, worst], None),
+        };
+        let [mean_mm, worst_mm] = of_waypoints;
+        let (vector_sqnr_db, controls, classes) = (vectors.sqnr_db(), controls.summary(), classes.summary());
+        Ok(Fidelity { vector_sqnr_db, mean_mm, worst_mm, controls, points, classes })
     }
 
     fn integers(&self, model: &QModel, frame: &Frame) -> Result<Seen> {
@@ -230,7 +249,11 @@ fn real(tensor: &QTensor, codes: &[f64]) -> Vec<f32> {
 }
 
 fn vector_name(graph: &Graph) -> Result<&str> {
-    let pool = graph.nodes.iter().rfind(|node| matches!(node.op, Op::GlobalPool)).map(|node| node.name.as_str());
+    let logits = points::logits(graph).map(|id| graph.value(id).name.as_str());
+    let pool = || graph.nodes.iter().rfind(|node| matches!(node.op, Op::GlobalPool)).map(|node| node.name.as_str());
     let output = || graph.outputs.first().map(|&id| graph.value(id).name.as_str());
-    pool.or_else(output).ok_or_else(|| Error::new(ErrorCode::Unsupported, &graph.name, "found no output to measure at"))
+    logits
+        .or_else(pool)
+        .or_else(output)
+        .ok_or_else(|| Error::new(ErrorCode::Unsupported, &graph.name, "found no output to measure at"))
 }

@@ -41,7 +41,7 @@ pub struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    /// Waypoints, controls or classes of frames: int8 from a model image, f32 from a checkpoint or ONNX file.
+    /// Waypoints, controls, points or classes of frames: int8 from a model image, f32 from a checkpoint or ONNX file.
     #[command(after_help = examples::RUN)]
     Run {
         /// Model image (OUT.img), checkpoint or ONNX file.
@@ -93,7 +93,7 @@ enum Command {
         common: Common,
     },
     /// What each choice of the quantizer is worth on a checkpoint: SQNR of the pooled vector, and error of waypoints or
-    /// controls, or SQNR of the logits and agreement of the classes.
+    /// controls, or SQNR of the logits, and error of points or agreement of the classes.
     #[command(after_help = examples::ABLATE)]
     Ablate {
         /// Checkpoint.
@@ -193,8 +193,8 @@ struct GateArgs {
     #[arg(long, value_name = "PERCENT", value_parser = percent)]
     min_top1: Option<f64>,
     /// Exit 1 where a limit of this file is missed: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm,
-    /// max_control_error, min_agreement_percent, min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, and
-    /// [steps] with "PATTERN" = dB.
+    /// max_control_error, max_point_error_px, min_agreement_percent, min_top1_percent, max_arena_bytes,
+    /// max_flash_bytes, max_loss_db, and [steps] with "PATTERN" = dB.
     #[arg(long, value_name = "FILE.toml")]
     gate: Option<PathBuf>,
 }

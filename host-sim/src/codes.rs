@@ -42,7 +42,7 @@ pub fn clip_range(tensor: &QTensor, op: &QOp) -> [f64; 2] {
     [low, high].map(|code| tensor.scale * (f64::from(code) - f64::from(tensor.zero_point)))
 }
 
-/// Clamp and zero point of an operator's output; `None` for copies, probabilities and waypoints.
+/// Clamp and zero point of an operator's output; `None` for copies, probabilities, points and waypoints.
 fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
     match op {
         QOp::Conv2d { rescale, .. } | QOp::Linear { rescale, .. } | QOp::BranchLinear { rescale, .. } => {
@@ -62,6 +62,7 @@ fn output_clamp(op: &QOp) -> Option<(Clamp, i16)> {
         | QOp::CopyBox { .. }
         | QOp::Softmax { .. }
         | QOp::Sigmoid { .. }
+        | QOp::SpatialSoftmax { .. }
         | QOp::WaypointDecoder(_) => None,
     }
 }
@@ -75,7 +76,7 @@ pub struct SaturationBounds {
 }
 
 impl SaturationBounds {
-    /// The bounds of a step; `None` where its output cannot saturate (copies, probabilities, waypoints).
+    /// The bounds of a step; `None` where its output cannot saturate (copies, probabilities, points, waypoints).
     pub fn of(step: &QStep) -> Option<Self> {
         let (clamp, zero_point) = output_clamp(&step.op)?;
         let Clamp { min, max } = clamp;

@@ -50,7 +50,7 @@ pub struct StepChange {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct FigureChange {
     /// `arena`, `flash`, `pooled vector`, `output`, `worst step`, `waypoint K, mean`, `waypoint K, max`; for waypoint K
-    /// also `steer`, `throttle`, `brake`, `predicted_speed`.
+    /// also `steer`, `throttle`, `brake`, `predicted_speed`, `point K`.
     pub figure: String,
     /// `B`, `dB` or `mm`; empty for a control.
     pub unit: String,
@@ -151,6 +151,10 @@ fn figures(before: &VerifyReport, after: &VerifyReport) -> Vec<FigureChange> {
     for (old, new) in old.control_error.iter().zip(&new.control_error) {
         figures.push(figure(&format!("{}, mean", new.name), "", Some(old.mean), Some(new.mean)));
         figures.push(figure(&format!("{}, max", new.name), "", Some(old.max), Some(new.max)));
+    }
+    for (k, (old, new)) in old.point_error_px.iter().zip(&new.point_error_px).enumerate() {
+        figures.push(figure(&format!("point {}, mean", k + 1), "px", Some(old.mean), Some(new.mean)));
+        figures.push(figure(&format!("point {}, max", k + 1), "px", Some(old.max), Some(new.max)));
     }
     figures.retain(|figure| figure.before.is_some() && figure.after.is_some());
     figures

@@ -115,8 +115,9 @@ pub fn load_graph(path: &Path, import: &ImportOptions) -> Result<Graph> {
 #[derive(Clone, Debug, Default, PartialEq, Eq, clap::Args)]
 #[group(skip)]
 pub struct FrameSource {
-    /// Frame directory: a folder per frame with rgb.png, lidar.bin and frame.json; for classifiers: a folder of images,
-    /// optionally with labels.csv (lines FILE,LABEL or FILE,LABEL,NAME).
+    /// Frame directory: a folder per frame with rgb.png, lidar.bin and frame.json (lbc: rgb.png, rgb_left.png,
+    /// rgb_right.png and frame.json); for classifiers: a folder of images, optionally with labels.csv (lines FILE,LABEL
+    /// or FILE,LABEL,NAME).
     #[arg(long, value_name = "DIR", required_unless_present = "inputs", conflicts_with = "inputs")]
     pub frames: Option<PathBuf>,
     /// Raw network inputs by name, first dimension = frames; of a classifier also `label`.

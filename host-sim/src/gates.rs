@@ -5,6 +5,7 @@
 //! min_output_sqnr_db = 18       # the first output
 //! max_waypoint_error_mm = 120   # every waypoint of every frame
 //! max_control_error = 0.02      # steer, throttle and brake of every frame, where the network gives them
+//! max_point_error_px = 2        # every point of every frame
 //! min_agreement_percent = 98.5  # of a classifier: frames on which int8 and f32 give one class
 //! min_top1_percent = 91         # of a classifier: frames on which the class is the label
 //! max_arena_bytes = 245760
@@ -20,7 +21,7 @@
 use crate::attention::{AttentionReport, FrameAttention};
 use crate::classification::ClassificationSummary;
 use crate::diff::Diff;
-use crate::report::{StepReport, VerifyReport, worst};
+use crate::report::{MeanAndMax, StepReport, VerifyReport, worst};
 use glob::Pattern;
 use model_compiler::error::{Error, ErrorCode, Result};
 use schemars::JsonSchema;
@@ -41,6 +42,8 @@ pub struct Gates {
     pub max_waypoint_error_mm: Option<f64>,
     /// Largest error of steer, throttle or brake of any frame.
     pub max_control_error: Option<f64>,
+    /// Largest point error of any frame, pixels.
+    pub max_point_error_px: Option<f64>,
     /// Fewest frames on which a classifier in int8 and in f32 gives one class, percent.
     pub min_agreement_percent: Option<f64>,
     /// Fewest frames on which the class is the label, percent.
@@ -120,6 +123,7 @@ struct File {
     min_output_sqnr_db: Option<Spanned<f64>>,
     max_waypoint_error_mm: Option<Spanned<f64>>,
     max_control_error: Option<Spanned<f64>>,
+    max_point_error_px: Option<Spanned<f64>>,
     min_agreement_percent: Option<Spanned<f64>>,
     min_top1_percent: Option<Spanned<f64>>,
     max_arena_bytes: Option<u64>,
@@ -138,8 +142,8 @@ pub fn is_percentage(value: f64) -> bool {
 }
 
 const FIELDS: &str = "fields: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm, max_control_error, \
-                      min_agreement_percent, min_top1_percent, max_arena_bytes, max_flash_bytes, max_loss_db, \
-                      [steps] with \"PATTERN\" = dB";
+                      max_point_error_px, min_agreement_percent, min_top1_percent, max_arena_bytes, max_flash_bytes, \
+                      max_loss_db, [steps] with \"PATTERN\" = dB";
 
 impl Gates {
     /// Reads a gate file.
@@ -191,6 +195,7 @@ impl Gates {
                 "millimeters, 0 or more",
             )?,
             max_control_error: distance("max_control_error", file.max_control_error, "an error, 0 or more")?,
+            max_point_error_px: distance("max_point_error_px", file.max_point_error_px, "pixels, 0 or more")?,
             min_agreement_percent: share("min_agreement_percent", file.min_agreement_percent)?,
             min_top1_percent: share("min_top1_percent", file.min_top1_percent)?,
             max_arena_bytes: file.max_arena_bytes,
@@ -208,6 +213,7 @@ impl Gates {
             min_output_sqnr_db: self.min_output_sqnr_db.or(other.min_output_sqnr_db),
             max_waypoint_error_mm: self.max_waypoint_error_mm.or(other.max_waypoint_error_mm),
             max_control_error: self.max_control_error.or(other.max_control_error),
+            max_point_error_px: self.max_point_error_px.or(other.max_point_error_px),
             min_agreement_percent: self.min_agreement_percent.or(other.min_agreement_percent),
             min_top1_percent: self.min_top1_percent.or(other.min_top1_percent),
             max_arena_bytes: self.max_arena_bytes.or(other.max_arena_bytes),
@@ -228,6 +234,7 @@ impl Gates {
             ("min_output_sqnr_db (--min-output-sqnr)", self.min_output_sqnr_db.is_some()),
             ("max_waypoint_error_mm", self.max_waypoint_error_mm.is_some()),
             ("max_control_error", self.max_control_error.is_some()),
+            ("max_point_error_px", self.max_point_error_px.is_some()),
             ("min_agreement_percent (--min-agreement)", self.min_agreement_percent.is_some()),
             ("max_loss_db (--max-loss)", self.max_loss_db.is_some()),
             ("steps", !self.steps.is_empty()),
@@ -268,18 +275,20 @@ impl Gates {
             let place = summary.output_step.as_ref().map(|step| format!("step {step}"));
             outcomes.push(GateOutcome::at_least("min_output_sqnr_db", place, summary.output_sqnr_db, limit, "dB"));
         }
-        if let Some(limit) = self.max_waypoint_error_mm {
-            let largest = summary.waypoint_error_mm.iter().enumerate().max_by(|a, b| a.1.max.total_cmp(&b.1.max));
-            let place = largest.map(|(k, _)| format!("waypoint {}", k + 1));
-            let found = largest.map(|(_, error)| error.max);
-            outcomes.push(GateOutcome::at_most("max_waypoint_error_mm", place, found, limit, "mm"));
-        }
+        outcomes.extend(
+            self.max_waypoint_error_mm
+                .map(|limit| farthest("max_waypoint_error_mm", "waypoint", &summary.waypoint_error_mm, limit, "mm")),
+        );
         if let Some(limit) = self.max_control_error {
             let controls = summary.control_error.iter().filter(|error| error.name != "predicted_speed");
             let largest = controls.max_by(|a, b| a.max.total_cmp(&b.max));
             let place = largest.map(|error| error.name.clone().into_owned());
             outcomes.push(GateOutcome::at_most("max_control_error", place, largest.map(|e| e.max), limit, ""));
         }
+        outcomes.extend(
+            self.max_point_error_px
+                .map(|limit| farthest("max_point_error_px", "point", &summary.point_error_px, limit, "px")),
+        );
         outcomes.extend(self.class_outcomes(summary.accuracy.as_ref())?);
         let sizes = [
             ("max_arena_bytes", summary.arena_bytes, self.max_arena_bytes),
@@ -340,6 +349,13 @@ pub fn attention_agreement(report: &AttentionReport, limit: f64) -> Result<GateO
     let worst = report.frames.iter().min_by(|a, b| keys_percent(a).total_cmp(&keys_percent(b)));
     let place = worst.map(|frame| format!("least on frame {}", frame.name));
     Ok(GateOutcome::at_least(GATE, place, Some(agreement.keys_percent), limit, "%"))
+}
+
+/// The gate on the largest error of several points; without any there is no figure, and it is missed.
+fn farthest(gate: &str, what: &str, errors: &[MeanAndMax], limit: f64, unit: &'static str) -> GateOutcome {
+    let largest = errors.iter().enumerate().max_by(|a, b| a.1.max.total_cmp(&b.1.max));
+    let place = largest.map(|(k, _)| format!("{what} {}", k + 1));
+    GateOutcome::at_most(gate, place, largest.map(|(_, error)| error.max), limit, unit)
 }
 
 fn lowest(gate: &str, steps: &[StepReport], limit: f64) -> GateOutcome {
@@ -418,6 +434,24 @@ mod tests {
             assert!(error.to_string().contains(expected), "{expected} not in: {error}");
             assert_eq!(error.code.exit_status(), 2);
         }
+    }
+
+    #[test]
+    fn points_have_a_gate_of_their_own() {
+        let mut report = report();
+        let error = |max| MeanAndMax { mean: 0.5, max };
+        report.summary.point_error_px = vec![error(1.0), error(2.5), error(2.0)];
+        let outcome = |limit| {
+            let gates = Gates::parse(&format!("max_point_error_px = {limit}")).unwrap();
+            gates.outcomes(&report).unwrap().remove(0)
+        };
+        assert!(outcome(2.5).met);
+        let missed = outcome(2.4);
+        assert_eq!((missed.met, missed.place.as_deref()), (false, Some("point 2")));
+        assert_eq!(missed.words(), "found 2.50 px, expected at most 2.4 px");
+        report.summary.point_error_px.clear();
+        let gates = Gates { max_point_error_px: Some(9.0), ..Gates::default() };
+        assert!(!gates.outcomes(&report).unwrap()[0].met, "a network without points");
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //! * [`backends`]: which of the firmware's kernels this machine can run
 //! * [`mod@bench`]: latency per step and whole, the backends side by side
 //! * [`demo`]: the whole way on the files of the source tree, without arguments
-//! * [`run`]: waypoints, controls or classes of frames, int8 from an image or f32 from a checkpoint
+//! * [`run`]: waypoints, [`controls`], [`points`] or classes of frames, int8 from an image or f32 from a checkpoint
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
 //!   f32 network: how much precision each step costs
 //! * [`attention`]: how often the fusing transformer looks from one sensor to the other, in integers and in f32
@@ -38,6 +38,7 @@ pub mod gates;
 pub mod histogram;
 pub mod metrics;
 pub mod noise;
+pub mod points;
 pub mod report;
 pub mod run;
 pub mod statistics;

@@ -17,6 +17,7 @@ use crate::diff::Diff;
 use crate::gates::GateOutcome;
 use crate::histogram::Histogram;
 use crate::noise::NoiseShares;
+use crate::points::Points;
 use crate::run::{ModelInfo, Waypoints};
 use memory::MemoryReport;
 use model_compiler::artifact;
@@ -103,10 +104,13 @@ pub struct Summary {
     #[serde(default)]
     pub output_sqnr_db: Option<f64>,
     /// Distance of waypoint k from the f32 network's.
-    pub waypoint_error_mm: Vec<WaypointError>,
+    pub waypoint_error_mm: Vec<MeanAndMax>,
     /// Of a network that gives controls: distance of each from the f32 network's.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub control_error: Vec<ControlError>,
+    /// Distance of point k from the f32 network's, pixels.
+    #[serde(default)]
+    pub point_error_px: Vec<MeanAndMax>,
     /// Size of the arena, bytes.
     pub arena_bytes: u64,
     /// Its lower bound, bytes.
@@ -121,9 +125,9 @@ pub struct Summary {
     pub accuracy: Option<ClassificationSummary>,
 }
 
-/// Mean and maximum over the frames, mm.
+/// Mean and maximum over the frames.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
-pub struct WaypointError {
+pub struct MeanAndMax {
     /// Mean.
     pub mean: f64,
     /// Maximum.
@@ -210,12 +214,21 @@ pub struct FrameReport {
     /// The same of the f32 network.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub reference_control: Option<ControlPrediction>,
+    /// Of the engine, −1..1.
+    #[serde(default)]
+    pub points: Option<Points>,
+    /// Of the f32 network.
+    #[serde(default)]
+    pub reference_points: Option<Points>,
     /// What a classifier says.
     #[serde(flatten)]
     pub classes: Option<ClassifiedFrame>,
     /// Distance of both, per waypoint, mm; empty where one is missing.
     #[serde(default)]
     pub waypoint_error_mm: Vec<f64>,
+    /// Distance of both, per point, pixels; empty where one is missing.
+    #[serde(default)]
+    pub point_error_px: Vec<f64>,
 }
 
 impl StepReport {
@@ -245,11 +258,12 @@ impl FrameReport {
         found.values().zip(expected.values()).map(|((name, f), (_, e))| (name, (f - e).abs())).collect()
     }
 
-    /// How bad the frame is, for sorting: the largest waypoint error in mm or error of a control, else the noise of the
+    /// How bad the frame is, for sorting: the largest error of a waypoint, control or point, else the noise of the
     /// output.
     pub fn badness(&self) -> f64 {
         let controls = self.control_errors().into_iter().map(|(_, error)| error);
-        let largest = self.waypoint_error_mm.iter().copied().chain(controls).reduce(f64::max);
+        let places = self.waypoint_error_mm.iter().chain(&self.point_error_px).copied();
+        let largest = places.chain(controls).reduce(f64::max);
         largest.or(self.output_sqnr_db.map(|db| -db)).unwrap_or(f64::NEG_INFINITY)
     }
 }
@@ -343,8 +357,9 @@ pub(crate) mod tests {
                 vector_sqnr_db: Some(30.0),
                 output_step: Some("conv1".into()),
                 output_sqnr_db: Some(21.5),
-                waypoint_error_mm: vec![WaypointError { mean: 1.25, max: 2.5 }],
+                waypoint_error_mm: vec![MeanAndMax { mean: 1.25, max: 2.5 }],
                 control_error: vec![],
+                point_error_px: vec![],
                 arena_bytes: 2048,
                 arena_bound_bytes: 2048,
                 arena_status: PlanStatus::Optimal,
@@ -368,8 +383,11 @@ pub(crate) mod tests {
                 reference_waypoints: Some(vec![[0.0, 1.001]]),
                 control: None,
                 reference_control: None,
+                points: None,
+                reference_points: None,
                 classes: None,
                 waypoint_error_mm: vec![1.0],
+                point_error_px: vec![],
             }],
             gates: vec![],
             baseline: None,

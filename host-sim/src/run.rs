@@ -1,4 +1,4 @@
-//! Waypoints, controls or classes of frames: int8 from an image, f32 from a checkpoint.
+//! Waypoints, controls, points or classes of frames: int8 from an image, f32 from a checkpoint.
 
 use crate::backends::Backend;
 use crate::buffers::GuardedArena;
@@ -6,6 +6,7 @@ use crate::classification::{Accuracy, Classification};
 use crate::codes::decode;
 use crate::controls::{ControlOutputs, ControlPrediction};
 use crate::files::{self, FrameSource, ImageFile};
+use crate::points::{PixelGrid, Points};
 use firmware::engine::{Engine, EngineError};
 use firmware::image::{Image, Port, TensorRecord};
 use firmware::program::Step;
@@ -56,6 +57,11 @@ pub enum Output {
     },
     /// Of a driving network that gives controls.
     Controls(ControlPrediction),
+    /// Of a driving network that points into its image.
+    Points {
+        /// Where to drive.
+        points: Points,
+    },
     /// Of a classifier.
     Class(Classification),
 }
@@ -82,7 +88,7 @@ impl RunReport {
     pub fn new(model: ModelInfo, frames: Vec<FrameResult>) -> Self {
         let classes = frames.iter().filter_map(|frame| match &frame.output {
             Output::Class(classification) => Some(classification),
-            Output::Waypoints { .. } | Output::Controls(_) => None,
+            Output::Waypoints { .. } | Output::Controls(_) | Output::Points { .. } => None,
         });
         let accuracy = Accuracy::of(classes);
         Self { schema: 1, model, frames, accuracy, class_names: BTreeMap::new() }
@@ -98,7 +104,7 @@ impl RunReport {
 /// Runs a model image (int8, on the firmware's engine) or a checkpoint (f32) over frames.
 ///
 /// # Errors
-/// The model or a frame cannot be read, or the network gives neither waypoints nor controls nor classes.
+/// The model or a frame cannot be read, or the network gives neither waypoints nor controls nor points nor classes.
 pub fn run(
     model: &Path,
     import: &ImportOptions,
@@ -119,10 +125,12 @@ fn run_image(file: &ImageFile, source: &FrameSource, backend: Backend, progress:
     let image = file.parse()?;
     let format = files::frame_format(&image)?;
     let mut device = Device::new(image, backend)?;
-    let (_, record) = device.outputs[0];
-    let gives_waypoints = record.element == ElementType::I32 && record.shape.channels == 2;
+    let (port, record) = device.outputs[0];
+    let points = PixelGrid::of_image(&image, port.tensor).map(OutputKind::Points);
+    let gives_pairs = record.element == ElementType::I32 && record.shape.channels == 2;
+    let pairs = points.or(gives_pairs.then_some(OutputKind::Waypoints));
     let names = device.outputs.iter().map(|(port, _)| port.name);
-    let kind = OutputKind::of(gives_waypoints, names, &format, image.name())?;
+    let kind = OutputKind::of(pairs, names, &format, image.name())?;
     let frames = source.load(&format)?;
     let results = each_frame(&frames, progress, |frame| kind.read(device.infer(frame)?, frame))?;
     let model = ModelInfo { name: image.name().to_owned(), sha256: artifact::hex(&file.sha256()) };
@@ -133,8 +141,10 @@ fn run_graph(graph: &Graph, model: ModelInfo, source: &FrameSource, progress: &P
     let format = FrameFormat::of_graph(graph);
     let gives_waypoints = graph.outputs.first().and_then(|&id| graph.producer(id));
     let gives_waypoints = gives_waypoints.is_some_and(|node| matches!(node.op, Op::WaypointDecoder(_)));
+    let points = PixelGrid::of_graph(graph).map(OutputKind::Points);
+    let pairs = points.or(gives_waypoints.then_some(OutputKind::Waypoints));
     let names = graph.outputs.iter().map(|&id| graph.value(id).name.as_str());
-    let kind = OutputKind::of(gives_waypoints, names, &format, &graph.name)?;
+    let kind = OutputKind::of(pairs, names, &format, &graph.name)?;
     let frames = source.load(&format)?;
     let results = each_frame(&frames, progress, |frame| {
         let inputs: Vec<Vec<f32>> = graph.inputs().map(|(_, kind)| frame.raw(kind)).collect::<Result<_>>()?;
@@ -164,22 +174,22 @@ fn each_frame(
 enum OutputKind {
     Waypoints,
     Controls(ControlOutputs),
+    Points(PixelGrid),
     Classes,
 }
 
 impl OutputKind {
+    /// `pairs`: what the first output is, if it holds pairs.
     fn of<'n>(
-        gives_waypoints: bool,
+        pairs: Option<Self>,
         outputs: impl Iterator<Item = &'n str>,
         format: &FrameFormat,
         network: &str,
     ) -> Result<Self> {
-        if gives_waypoints {
-            return Ok(Self::Waypoints);
-        }
-        let controls = ControlOutputs::find(outputs).map(Self::Controls);
-        controls.or(format.classes.map(|_| Self::Classes)).ok_or_else(|| {
-            let message = "its first output holds neither waypoints nor controls nor classes";
+        let controls = || ControlOutputs::find(outputs).map(Self::Controls);
+        let classes = || format.classes.map(|_| Self::Classes);
+        pairs.or_else(controls).or_else(classes).ok_or_else(|| {
+            let message = "its first output holds neither waypoints nor controls nor points nor classes";
             Error::new(ErrorCode::Unsupported, format!("network {network}"), message)
         })
     }
@@ -191,6 +201,7 @@ impl OutputKind {
             Self::Controls(controls) => Output::Controls(controls.read(&outputs).ok_or_else(|| {
                 Error::new(ErrorCode::Unsupported, "output `controls`", "expected steer, throttle and brake")
             })?),
+            Self::Points(grid) => Output::Points { points: grid.points(&outputs[0]) },
             Self::Classes => Output::Class(Classification::new(outputs.swap_remove(0), frame)),
         })
     }

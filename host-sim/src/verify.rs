@@ -9,8 +9,9 @@ use crate::diff::Diff;
 use crate::files::{self, FrameSource, ImageFile};
 use crate::gates::Gates;
 use crate::noise::{self, Selection};
+use crate::points::PixelGrid;
 use crate::report::memory::MemoryReport;
-use crate::report::{FrameReport, StepReport, Summary, VerifyReport, WaypointError, json, worst};
+use crate::report::{FrameReport, MeanAndMax, StepReport, Summary, VerifyReport, json, worst};
 use crate::run::{ModelInfo, Waypoints, waypoints};
 use crate::statistics::{ErrorSums, Spread};
 use crate::trace::{FrameTrace, StepFigures, Tracer};
@@ -124,7 +125,7 @@ fn compare_and_measure(
     progress.set_length(tracer.units_per_frame() * frames.len() as u64);
     let known = calibration_digests(&record.model);
     let overlap = frames::overlap(&known, frames);
-    let mut waypoint_errors = Vec::new();
+    let (mut waypoint_errors, mut point_errors) = (Vec::new(), Vec::new());
     let is_classifier = FrameFormat::of_model(&record.model).classes.is_some();
     let mut classes = Comparison::default();
     let mut controls = ControlComparison::default();
@@ -138,7 +139,8 @@ fn compare_and_measure(
             let reference = trace.reference_outputs.as_ref().map(|outputs| outputs[0].as_slice());
             report.classes = Some(classes.add(frame, &trace.outputs[0], reference));
         }
-        add_waypoint_errors(&mut waypoint_errors, &report);
+        add_errors(&mut waypoint_errors, &report.waypoint_error_mm);
+        add_errors(&mut point_errors, &report.point_error_px);
         if let (Some(found), Some(expected)) = (&report.control, &report.reference_control) {
             controls.add(found, expected);
         }
@@ -159,7 +161,7 @@ fn compare_and_measure(
     let summary = Summary {
         accuracy: classes.summary(),
         control_error: controls.summary(),
-        ..summary(record, &steps, &waypoint_errors)
+        ..summary(record, &steps, &waypoint_errors, &point_errors)
     };
     Ok(VerifyReport {
         schema: json::SCHEMA,
@@ -191,10 +193,16 @@ fn frame_report(record: &Record, frame: &Frame, trace: &FrameTrace, calibration:
     let model = &record.model;
     let is_waypoints = |port: &model_compiler::qmodel::Port| {
         let tensor = model.tensor(port.tensor);
-        tensor.element == ElementType::I32 && tensor.shape.channels == 2
+        let pairs = tensor.element == ElementType::I32 && tensor.shape.channels == 2;
+        pairs && PixelGrid::of_model(model, port.tensor).is_none()
     };
     let output = model.outputs.iter().position(is_waypoints);
     let reference = trace.reference_outputs.as_ref();
+    let grids = model.outputs.iter().map(|port| PixelGrid::of_model(model, port.tensor));
+    let grid = grids.enumerate().find_map(|(i, grid)| Some((i, grid?)));
+    let points = grid.map(|(i, grid)| grid.points(&trace.outputs[i]));
+    let reference_points = grid.and_then(|(i, grid)| Some(grid.points(&reference?[i])));
+    let point_distances = || Some(grid?.1.distances(points.as_ref()?, reference_points.as_ref()?));
     let found = output.map(|i| waypoints(&trace.outputs[i]));
     let expected = output.and_then(|i| Some(waypoints(&reference?[i])));
     let controls = ControlOutputs::find(model.outputs.iter().map(|port| port.name.as_str()));
@@ -212,18 +220,23 @@ fn frame_report(record: &Record, frame: &Frame, trace: &FrameTrace, calibration:
         vector_sqnr_db: decibels(vector_position(record)),
         output_sqnr_db: decibels(output_position(record)),
         waypoint_error_mm: found.as_ref().zip(expected.as_ref()).map(|(f, e)| distances_mm(f, e)).unwrap_or_default(),
+        point_error_px: point_distances().unwrap_or_default(),
         waypoints: found,
         reference_waypoints: expected,
         control: controls.and_then(|controls| controls.read(&trace.outputs)),
         reference_control: controls.and_then(|controls| controls.read(reference?)),
+        points,
+        reference_points,
         classes: None,
     }
 }
 
-/// Position of the step that writes the last pooled vector.
+/// Position of the step that writes the last pooled vector; what points come from is a map, whatever is pooled beside
+/// it.
 fn vector_position(record: &Record) -> Option<usize> {
     let is_pool = |&step: &u32| matches!(record.model.steps[step as usize].op, QOp::GlobalPool { .. });
-    record.plan.order.iter().rposition(is_pool)
+    let points = record.model.outputs.first().and_then(|port| PixelGrid::of_model(&record.model, port.tensor));
+    record.plan.order.iter().rposition(is_pool).filter(|_| points.is_none())
 }
 
 /// Position of the step that writes the first output.
@@ -232,11 +245,15 @@ fn output_position(record: &Record) -> Option<usize> {
     record.plan.order.iter().rposition(|&step| record.model.steps[step as usize].op.output() == output)
 }
 
-fn add_waypoint_errors(errors: &mut Vec<Spread>, frame: &FrameReport) {
-    errors.resize(errors.len().max(frame.waypoint_error_mm.len()), Spread::default());
-    for (spread, millimeters) in errors.iter_mut().zip(&frame.waypoint_error_mm) {
-        spread.add(*millimeters);
+fn add_errors(errors: &mut Vec<Spread>, of_frame: &[f64]) {
+    errors.resize(errors.len().max(of_frame.len()), Spread::default());
+    for (spread, error) in errors.iter_mut().zip(of_frame) {
+        spread.add(*error);
     }
+}
+
+fn means_and_maxima(errors: &[Spread]) -> Vec<MeanAndMax> {
+    errors.iter().map(|spread| MeanAndMax { mean: spread.mean(), max: spread.max() }).collect()
 }
 
 fn distances_mm(found: &Waypoints, expected: &Waypoints) -> Vec<f64> {
@@ -274,7 +291,7 @@ fn step_reports(record: &Record, figures: &[StepFigures]) -> Vec<StepReport> {
     steps.zip(figures).enumerate().map(report).collect()
 }
 
-fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread]) -> Summary {
+fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread], point_errors: &[Spread]) -> Summary {
     let plan = &record.plan;
     let step = |position: Option<usize>| steps.get(position?);
     let (vector, output) = (step(vector_position(record)), step(output_position(record)));
@@ -286,8 +303,9 @@ fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread]) ->
         vector_sqnr_db: vector.and_then(|step| step.sqnr_db),
         output_step: output.map(|step| step.step.clone()),
         output_sqnr_db: output.and_then(|step| step.sqnr_db),
-        waypoint_error_mm: waypoint_errors.iter().map(|s| WaypointError { mean: s.mean(), max: s.max() }).collect(),
+        waypoint_error_mm: means_and_maxima(waypoint_errors),
         control_error: Vec::new(),
+        point_error_px: means_and_maxima(point_errors),
         arena_bytes: plan.arena_bytes,
         arena_bound_bytes: plan.bound_bytes,
         arena_status: plan.status,

@@ -142,6 +142,12 @@ pub struct ImportArgs {
     /// Factor of the grey levels before --mean and --std: a number or a fraction [default: 1/255].
     #[arg(long, value_parser = fraction, requires = "mean")]
     scale: Option<f64>,
+    /// Checkpoint of lbc: the network was trained on views of half the size (its hyper-parameter of this name).
+    #[arg(long)]
+    hack: bool,
+    /// Checkpoint of lbc: what divides the logits before the spatial softmax [default: 5].
+    #[arg(long, value_parser = positive)]
+    temperature: Option<f64>,
 }
 
 /// `HEIGHTxWIDTH`.
@@ -220,6 +226,8 @@ impl ImportArgs {
             fusion_scales: self.fusion_scales,
             resolution,
             normalization: self.normalization(),
+            hack: self.hack,
+            temperature: self.temperature.map(|t| t as f32),
         })
     }
 

@@ -2,7 +2,7 @@
 //!
 //! Three sources give the same [`Frame`]:
 //! * a **frame directory** `FRAMES/<name>/{rgb.png, lidar.bin, frame.json}`: sensor data, prepared here ([`camera`],
-//!   [`bev`], [`correspondence`]) by the rules that the networks were trained with
+//!   [`bev`], [`correspondence`], [`views`]) by the rules that the networks were trained with
 //! * an **image directory**, for classifiers: PNG or JPEG files and, optionally, their labels ([`images`])
 //! * a **tensor file** (`.safetensors`) of ready network inputs, first dimension = frames
 //!
@@ -22,6 +22,7 @@ mod directory;
 pub mod images;
 pub mod labels;
 mod tensors;
+pub mod views;
 
 pub use labels::Label;
 
@@ -46,6 +47,8 @@ pub struct FrameFormat {
     pub points: Option<Shape>,
     /// Navigation command.
     pub command: bool,
+    /// Three camera views and the heatmap of the target, `H×W×10`.
+    pub views: Option<Shape>,
     /// Height that separates the two histogram channels: meters, relative to a sensor 2.5 m above ground.
     pub split_height_m: f64,
 }
@@ -63,6 +66,7 @@ impl FrameFormat {
             goal: false,
             points: None,
             command: false,
+            views: None,
             split_height_m: split_height_m(system),
         };
         for (kind, shape) in inputs {
@@ -73,6 +77,7 @@ impl FrameFormat {
                 InputKind::Goal => format.goal = true,
                 InputKind::BevPoints | InputKind::CameraPoints => format.points = Some(shape),
                 InputKind::Command => format.command = true,
+                InputKind::Views => format.views = Some(shape),
             }
         }
         format
@@ -81,8 +86,8 @@ impl FrameFormat {
     /// The same, of a classifier if there is nothing but one image to read and the first output is a vector.
     #[must_use]
     pub fn with_output(mut self, image_name: &str, output: Option<Shape>) -> Self {
-        let others = self.bev.is_some() || self.velocity || self.goal || self.command || self.points.is_some();
-        let is_only_input = self.image.is_some() && !others;
+        let maps = self.bev.is_some() || self.points.is_some() || self.views.is_some();
+        let is_only_input = self.image.is_some() && !(maps || self.velocity || self.goal || self.command);
         self.classes = output.filter(|s| is_only_input && (s.height, s.width) == (1, 1)).map(|s| s.channels);
         if self.classes.is_some() {
             self.image_name = image_name.into();
@@ -123,6 +128,15 @@ pub struct ByteMap {
     pub data: Vec<u8>,
 }
 
+/// A map of real values, channel fastest.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RealMap {
+    /// Height, width, channels.
+    pub shape: Shape,
+    /// `height·width·channels` values.
+    pub data: Vec<f32>,
+}
+
 /// One moment of driving, or one image to classify.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Frame {
@@ -136,6 +150,8 @@ pub struct Frame {
     pub velocity: Option<f64>,
     /// Goal `[right, forward-negative]`, m.
     pub goal: Option<[f64; 2]>,
+    /// Views front, left, right (three channels each) and the heatmap of the target, `H×W×10` in grey levels 0..=255.
+    pub views: Option<RealMap>,
     /// Navigation command 1..=6: left, right, straight, lane follow, change left, change right.
     pub command: Option<u8>,
     /// Cells of the camera image for each cell of the LiDAR map ([`correspondence`]).
@@ -149,7 +165,8 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The values of one network input in raw units: grey levels, counts, m/s, m, a command's number, numbers of cells.
+    /// The values of one network input in raw units: grey levels (of views not always whole ones), counts, m/s, m, a
+    /// command's number, numbers of cells.
     ///
     /// # Errors
     /// The frame does not hold this input.
@@ -163,6 +180,7 @@ impl Frame {
             InputKind::BevPoints => self.bev_points.as_ref().map(bytes),
             InputKind::CameraPoints => self.camera_points.as_ref().map(bytes),
             InputKind::Command => self.command.map(|c| vec![f32::from(c)]),
+            InputKind::Views => self.views.as_ref().map(|views| views.data.clone()),
         };
         values.ok_or_else(|| {
             Error::new(
@@ -181,6 +199,7 @@ impl Frame {
             rgb: self.rgb.as_ref().map(flip_columns),
             bev: self.bev.as_ref().map(flip_rows),
             goal: self.goal.map(|[right, y]| [0.0 - right, y]),
+            views: self.views.as_ref().map(views::mirrored),
             command: self.command.map(mirrored_command),
             bev_points: self.bev_points.as_ref().map(correspondence::mirrored),
             camera_points: self.camera_points.as_ref().map(correspondence::mirrored),
@@ -192,7 +211,7 @@ impl Frame {
     /// calibration runs a frame under every command.
     pub fn digest(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
-        for kind in INPUT_KINDS {
+        for kind in INPUT_KINDS.into_iter().filter(|&kind| kind != InputKind::Command) {
             if let Ok(values) = self.raw(kind) {
                 hash.update(input_name(kind));
                 values.iter().for_each(|v| hash.update(v.to_le_bytes()));
@@ -208,13 +227,15 @@ impl Frame {
 }
 
 /// Every kind of network input.
-pub const INPUT_KINDS: [InputKind; 6] = [
+pub const INPUT_KINDS: [InputKind; 8] = [
     InputKind::Image,
     InputKind::Bev,
     InputKind::Velocity,
     InputKind::Goal,
     InputKind::BevPoints,
     InputKind::CameraPoints,
+    InputKind::Command,
+    InputKind::Views,
 ];
 
 /// Name of a network input, as ports carry it.
@@ -227,6 +248,7 @@ pub fn input_name(kind: InputKind) -> &'static str {
         InputKind::BevPoints => "bev_points",
         InputKind::CameraPoints => "cam_points",
         InputKind::Command => "command",
+        InputKind::Views => "views",
     }
 }
 

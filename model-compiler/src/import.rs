@@ -122,12 +122,12 @@ pub enum System {
     GeometricFusion,
     /// Image (ResNet-18), speed and command, controls.
     Cilrs,
-    /// Learning by cheating; recognized, not supported.
+    /// Learning by cheating: three views and a heatmap of the target (DeepLabV3 on ResNet-50), points in the image.
     Lbc,
 }
 
 impl System {
-    /// Every system that is recognized.
+    /// Every system.
     pub const ALL: [Self; 6] =
         [Self::Aim, Self::LateFusion, Self::TransFuser, Self::GeometricFusion, Self::Cilrs, Self::Lbc];
 
@@ -143,6 +143,11 @@ impl System {
         }
     }
 
+    /// The names of all systems, in a row.
+    fn names() -> String {
+        Self::ALL.map(Self::name).join(", ")
+    }
+
     /// The system whose tensor names these are.
     pub fn detect(tensors: &NamedTensors) -> Option<Self> {
         systems::detect(tensors)
@@ -154,9 +159,8 @@ impl FromStr for System {
 
     fn from_str(name: &str) -> Result<Self> {
         Self::ALL.into_iter().find(|s| s.name() == name).ok_or_else(|| {
-            let names: Vec<_> = Self::ALL.iter().map(|s| s.name()).collect();
             Error::new(ErrorCode::Usage, "", format!("unknown system '{name}'"))
-                .with_help(format!("one of {}", names.join(", ")))
+                .with_help(format!("one of {}", Self::names()))
         })
     }
 }
@@ -176,6 +180,10 @@ pub struct ImportOptions {
     /// ONNX: mean and deviation of the image in grey levels 0..=255, one value for all channels or one for each. When
     /// absent: ImageNet's for three channels, 0 and 255 (so 0..1) for one.
     pub normalization: Option<Normalization>,
+    /// LBC: halve the views before the network and double its maps behind it.
+    pub hack: bool,
+    /// LBC: what divides the logits before the spatial softmax, positive; 5 when absent.
+    pub temperature: Option<f32>,
 }
 
 /// Builds the float graph of a file, a checkpoint or an ONNX model, told by its content.
@@ -200,13 +208,13 @@ pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
 
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
 ///
-/// Inputs are `rgb`, `bev`, `velocity`, `command`, `bev_points`, `cam_points` and `goal`, as far as the system has them, in
-/// raw units; the output is `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake) and
-/// `predicted_speed` (m/s). Values carry the names of the checkpoint's modules.
+/// Inputs are `rgb`, `bev`, `velocity`, `command`, `bev_points`, `cam_points`, `goal` and `views`, as far as the system
+/// has them, in raw units; the output is `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake) and
+/// `predicted_speed` (m/s), of LBC `points` (pixels). Values carry the names of the checkpoint's modules.
 ///
 /// # Errors
-/// `Unsupported`: no known system, one that is not supported, or sizes that do not fit together. `Tensors`: the list
-/// of tensors that are missing, surplus, misshapen or not finite.
+/// `Unsupported`: no known system, or sizes that do not fit together. `Tensors`: the list of tensors that are missing,
+/// surplus, misshapen or not finite. `Usage`: an option that belongs to another system.
 pub fn import(name: &str, tensors: NamedTensors, options: &ImportOptions) -> Result<Graph> {
     let system =
         options.system.or_else(|| System::detect(&tensors)).ok_or_else(|| unrecognized(&tensors).within(name))?;
@@ -220,9 +228,10 @@ fn unrecognized(tensors: &NamedTensors) -> Error {
     } else {
         format!("the tensor names are of no known system ({} tensors: {}, …)", tensors.len(), first.join(", "))
     };
-    Error::new(ErrorCode::Unsupported, "", message).with_help(
-        "supported are checkpoints of aim, late_fusion, transfuser, geometric_fusion and cilrs (2021); --system names one",
-    )
+    Error::new(ErrorCode::Unsupported, "", message).with_help(format!(
+        "supported are checkpoints of {} (versions up to 2021); --system names one",
+        System::names()
+    ))
 }
 
 #[cfg(test)]
@@ -253,6 +262,7 @@ mod tests {
             ),
             (System::Cilrs, names(&["encoder.features.conv1.weight", "controller.vel_in.0.weight"])),
             (System::Lbc, names(&["net.network.backbone.conv1.weight"])),
+            (System::Lbc, names(&["model.net.network.backbone.conv1.weight", "model.teacher.net.norm.bias"])),
         ] {
             assert_eq!(System::detect(&tensors), Some(system));
             assert_eq!(system.name().parse::<System>().unwrap(), system);
@@ -261,23 +271,13 @@ mod tests {
     }
 
     #[test]
-    fn systems_that_come_later_are_refused_by_name() {
-        for system in [System::Lbc] {
-            let options = ImportOptions { system: Some(system), ..Default::default() };
-            let error = import("file.pth", names(&["x"]), &options).unwrap_err();
-            assert_eq!(error.code, ErrorCode::Unsupported);
-            assert!(error.to_string().starts_with("file.pth: "), "{error}");
-            assert!(error.message.contains(system.name()), "{error}");
-        }
-    }
-
-    #[test]
     fn foreign_checkpoint_is_refused_with_its_first_names() {
         let error = import("m.pth", names(&["fc.bias", "fc.weight"]), &ImportOptions::default()).unwrap_err();
         assert_eq!(
             error.to_string(),
             "m.pth: the tensor names are of no known system (2 tensors: fc.bias, fc.weight, …)\n  \
-             help: supported are checkpoints of aim, late_fusion, transfuser, geometric_fusion and cilrs (2021); --system names one"
+             help: supported are checkpoints of aim, late_fusion, transfuser, geometric_fusion, cilrs, lbc \
+             (versions up to 2021); --system names one"
         );
     }
 

@@ -27,6 +27,7 @@ mod rescale;
 mod resize_bilinear;
 mod sigmoid;
 mod softmax;
+mod spatial_softmax;
 mod sum;
 #[cfg(test)]
 mod testing;
@@ -182,6 +183,10 @@ fn dispatch(operands: &Operands, op: &QOp) -> Result<Vec<f64>> {
         QOp::Sigmoid { input, output, input_zero_point, requant, tanh_table } => {
             let term = QTerm { tensor: *input, zero_point: *input_zero_point, multiplier: requant.multiplier };
             sigmoid::sigmoid(operands, term, requant.shift, *output, tanh_table)
+        }
+        QOp::SpatialSoftmax { input, output, exponent, exp_table } => {
+            let exponential = softmax::Exponential::new(*exponent, exp_table)?;
+            spatial_softmax::spatial_softmax(operands, *input, *output, &exponential)
         }
     }
 }

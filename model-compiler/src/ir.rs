@@ -58,6 +58,9 @@ pub enum InputKind {
     CameraPoints,
     /// Navigation command, one number from 1 on: it selects a branch.
     Command,
+    /// Three RGB views (front, left, right) and the heatmap of the target, in grey levels 0..=255; the heatmap's are no
+    /// whole numbers.
+    Views,
 }
 
 /// Bounds of a result: `min(max(x, min), max)`. ReLU is `0..∞`, ReLU6 `0..6`.
@@ -284,6 +287,12 @@ pub enum Op {
     BranchLinear(BranchLinear),
     /// `[x]`: `1 / (1 + exp(−x))` of each element.
     Sigmoid,
+    /// `[map]`: per channel the expected `[column, row]` under `exp(x / temperature) / Σ exp(x / temperature)` over all
+    /// pixels, in pixels from the center of the first; `channels × 1 × 2`.
+    SpatialSoftmax {
+        /// Divides the logits; positive.
+        temperature: f32,
+    },
 }
 
 /// One operator application.
@@ -394,6 +403,7 @@ impl Op {
             Self::GatherSum => "gather_sum",
             Self::BranchLinear(_) => "branch_linear",
             Self::Sigmoid => "sigmoid",
+            Self::SpatialSoftmax { .. } => "spatial_softmax",
         }
     }
 

@@ -14,7 +14,7 @@ use firmware::kernels::{k4n16, plan};
 use firmware::program::{
     Add, Attention, AveragePool, BranchLinear, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GatherSum,
     GlobalPool, KernelId, LayerNorm, Linear, MaxPool, Requantize, Rescale, Residual, ResizeBilinear, Sigmoid, Softmax,
-    Step, Term, TokenSource, Tokens, WaypointDecoder,
+    SpatialSoftmax, Step, Term, TokenSource, Tokens, WaypointDecoder,
 };
 use firmware::tensor::TensorId;
 
@@ -326,6 +326,12 @@ impl Packer {
                 input_zero_point: *input_zero_point,
                 requant: *requant,
                 tanh_table: self.constants.push(tanh_table)?,
+            }),
+            QOp::SpatialSoftmax { input, output, exponent, exp_table } => Step::SpatialSoftmax(SpatialSoftmax {
+                input: tensor_id(*input)?,
+                output: tensor_id(*output)?,
+                exponent: *exponent,
+                exp_table: self.constants.push(exp_table)?,
             }),
         })
     }

@@ -14,6 +14,7 @@ mod dead_code;
 mod fixture;
 mod fold_batch_norm;
 mod fold_batch_norm_forward;
+mod fold_grey_norm;
 mod fold_normalization;
 mod fold_padding;
 mod fuse_activation;
@@ -51,10 +52,11 @@ pub fn optimize(graph: &mut Graph) -> Result<()> {
 /// `Numeric`: what the verifier found, such as a folded weight that exceeds the range of `f32`.
 pub fn optimize_with(graph: &mut Graph, options: PassOptions) -> Result<()> {
     type Pass<'a> = &'a dyn Fn(&mut Graph);
-    let passes: [(&str, Pass<'_>); 12] = [
+    let passes: [(&str, Pass<'_>); 13] = [
         ("fold_padding", &fold_padding::run),
         ("fold_batch_norm", &fold_batch_norm::run),
         ("fold_batch_norm_forward", &fold_batch_norm_forward::run),
+        ("fold_grey_norm", &fold_grey_norm::run),
         ("lower_batch_norm", &lower_batch_norm::run),
         ("fold_normalization", &fold_normalization::run),
         ("lower_normalization", &lower_normalization::run),

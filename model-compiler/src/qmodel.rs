@@ -334,6 +334,13 @@ pub enum QOp {
         /// 513 entries.
         tanh_table: Vec<i16>,
     },
+    SpatialSoftmax {
+        input: QTensorId,
+        output: QTensorId,
+        exponent: Requant,
+        /// 257 entries.
+        exp_table: Vec<i16>,
+    },
 }
 
 impl QModel {
@@ -365,6 +372,7 @@ impl QOp {
             Self::GatherSum { .. } => "gather_sum",
             Self::BranchLinear { .. } => "branch_linear",
             Self::Sigmoid { .. } => "sigmoid",
+            Self::SpatialSoftmax { .. } => "spatial_softmax",
         }
     }
 
@@ -376,6 +384,7 @@ impl QOp {
                 | Self::CopyBox { .. }
                 | Self::Softmax { .. }
                 | Self::Sigmoid { .. }
+                | Self::SpatialSoftmax { .. }
                 | Self::WaypointDecoder(_)
         )
     }
@@ -400,6 +409,7 @@ impl QOp {
             | Self::CopyBox { .. }
             | Self::Softmax { .. }
             | Self::Sigmoid { .. }
+            | Self::SpatialSoftmax { .. }
             | Self::WaypointDecoder(_) => None,
         }
     }
@@ -435,7 +445,8 @@ impl QOp {
             | Self::LayerNorm { input, .. }
             | Self::CopyBox { input, .. }
             | Self::Softmax { input, .. }
-            | Self::Sigmoid { input, .. } => vec![*input],
+            | Self::Sigmoid { input, .. }
+            | Self::SpatialSoftmax { input, .. } => vec![*input],
             Self::BranchLinear { input, command, .. } => vec![*input, *command],
             Self::GlobalPool { first, second, .. } => {
                 std::iter::once(first.tensor).chain(second.map(|t| t.tensor)).collect()
@@ -471,7 +482,8 @@ impl QOp {
             | Self::Softmax { output, .. }
             | Self::GatherSum { output, .. }
             | Self::BranchLinear { output, .. }
-            | Self::Sigmoid { output, .. } => *output,
+            | Self::Sigmoid { output, .. }
+            | Self::SpatialSoftmax { output, .. } => *output,
             Self::WaypointDecoder(d) => d.output,
         }
     }

@@ -27,6 +27,7 @@ pub mod ranges;
 mod rounding;
 mod sigmoid;
 mod softmax;
+mod spatial_softmax;
 mod sums;
 pub mod tables;
 #[cfg(test)]
@@ -241,6 +242,7 @@ impl Builder<'_> {
             Op::GatherSum => self.gather_sum(node),
             Op::BranchLinear(layer) => self.branch_linear(node, layer),
             Op::Sigmoid => self.sigmoid(node),
+            Op::SpatialSoftmax { temperature } => self.spatial_softmax(node, *temperature),
             Op::Normalize(_) | Op::BatchNorm(_) => Err(Error::new(
                 ErrorCode::Unsupported,
                 "",

@@ -20,6 +20,7 @@ mod pool;
 mod rerun;
 mod resize_bilinear;
 mod slice;
+mod spatial_softmax;
 mod tokens;
 mod waypoint_decoder;
 
@@ -48,7 +49,7 @@ impl Activations {
 
 /// Runs a graph and returns its outputs; a value is dropped after its last use.
 ///
-/// `inputs` are raw, in the order of [`Graph::inputs`]: image 0..=255 and BEV counts 0..=5, both
+/// `inputs` are raw, in the order of [`Graph::inputs`]: image and views 0..=255 and BEV counts 0..=5, all
 /// `height × width × channels`; velocity `[m/s]`; goal `[right, forward-negative]` in m; command `[1, 2, …]`. `observe`
 /// sees every node with its output, in order (for a BEV input that is counts / 5).
 ///
@@ -130,6 +131,9 @@ pub fn evaluate(op: &Op, input_shapes: &[Shape], inputs: &[&[f32]], output_shape
         Op::GatherSum => gather_sum::gather_sum(input_shapes[0], inputs, output_shape),
         Op::BranchLinear(layer) => linear::branch_linear(layer, inputs),
         Op::Sigmoid => elementwise::sigmoid(inputs[0]),
+        Op::SpatialSoftmax { temperature } => {
+            spatial_softmax::spatial_softmax(*temperature, input_shapes[0], inputs[0])
+        }
     }
 }
 

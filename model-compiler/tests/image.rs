@@ -46,10 +46,11 @@ fn sample_is_accepted() {
     for (id, record) in parts.tensors.iter().enumerate() {
         assert_eq!(image.tensor(TensorId(id as u16)).as_ref(), Some(record));
     }
-    let goal = image.input(3).expect("five inputs");
+    let goal = image.input(3).expect("six inputs");
     assert_eq!((goal.name, goal.tensor.0, goal.scale), ("goal", ids::GOAL, 0.5));
-    assert!(image.input(5).is_none() && image.output(3).is_none());
-    assert_eq!(image.output(0).expect("one output").name, "waypoints");
+    assert!(image.input(6).is_none() && image.output(5).is_none());
+    let names = [0, 1, 2, 3, 4].map(|output| image.output(output).expect("five outputs").name);
+    assert_eq!(names, ["waypoints", "probabilities", "gathered", "controls", "points"]);
 }
 
 #[test]
@@ -313,8 +314,21 @@ fn engine_refuses_wrong_use() {
     assert_eq!(engine.output(0), Err(EngineError::NotDone));
     engine.infer(&slices).expect("runs");
     assert_eq!(engine.step(), Ok(Progress::Done));
-    assert_eq!(engine.output(3), Err(EngineError::NoSuchOutput(3)));
+    assert_eq!(engine.output(5), Err(EngineError::NoSuchOutput(5)));
     assert_eq!(engine.output(0).expect("done").len(), 32);
+}
+
+#[test]
+fn only_pairs_of_q16_meters_are_waypoints() {
+    let bytes = sample();
+    let image = Image::parse(&bytes).expect("parses");
+    let mut arena = arena_for(&image);
+    let mut engine = Engine::new(image, Portable, &mut arena).expect("fits");
+    let given = inputs(&image, 1);
+    engine.infer(&given.iter().map(Vec::as_slice).collect::<Vec<_>>()).expect("runs");
+    assert_eq!(engine.waypoints(0).map(|waypoints| waypoints.len()), Ok(4));
+    assert_eq!(engine.waypoints(1), Err(EngineError::NoWaypoints(1)), "16-bit probabilities");
+    assert_eq!(engine.waypoints(4), Err(EngineError::NoWaypoints(4)), "points in 1/64 pixel");
 }
 
 #[test]

@@ -326,6 +326,7 @@ fn memory_changes() -> Vec<(Check, Change)> {
         (Check::ConstLength, Parts(|p| step!(p, at::BRANCH_LINEAR, BranchLinear, |s| s.rescale.bias.bytes = 12))),
         (Check::ConstLength, Parts(|p| step!(p, at::BRANCH_LINEAR, BranchLinear, |s| s.branches = 3))),
         (Check::ConstLength, Parts(|p| step!(p, at::SIGMOID, Sigmoid, |s| s.tanh_table.bytes -= 2))),
+        (Check::ConstLength, Parts(|p| step!(p, at::SPATIAL_SOFTMAX, SpatialSoftmax, |s| s.exp_table.bytes += 2))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.concat = true))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.tanh_table.bytes -= 2))),
         (Check::ConstLength, Parts(|p| step!(p, at::DECODER, WaypointDecoder, |s| s.biases.bytes -= 8))),
@@ -434,6 +435,18 @@ fn operator_changes() -> Vec<(Check, Change)> {
         (Check::StepMultiplier, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.first.requant.multiplier = 1))),
         (Check::StepShift, Parts(|p| step!(p, at::CONCAT, Concat, |s| s.second.requant.shift = 0))),
         (Check::StepShift, Parts(|p| step!(p, at::SOFTMAX, Softmax, |s| s.exponent.shift = 53))),
+        (Check::StepShift, Parts(|p| step!(p, at::SPATIAL_SOFTMAX, SpatialSoftmax, |s| s.exponent.shift = 0))),
+        (
+            Check::StepMultiplier,
+            Parts(|p| step!(p, at::SPATIAL_SOFTMAX, SpatialSoftmax, |s| s.exponent.multiplier = 1)),
+        ),
+        (
+            Check::StepElement,
+            Parts(|p| step!(p, at::SPATIAL_SOFTMAX, SpatialSoftmax, |s| s.input = TensorId(ids::SUM))),
+        ),
+        (Check::StepShape, Parts(|p| record(p, ids::POINTS).shape = Shape::tokens(4, 4))),
+        (Check::StepPixels, Parts(|p| *p = spatial_softmax_alone(Shape::map(1, 257, 2)))),
+        (Check::StepPixels, Parts(|p| *p = spatial_softmax_alone(Shape::map(257, 256, 1)))),
         (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.begin[0] = 2))),
         (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.stride[2] = 6))),
         (Check::StepBox, Parts(|p| step!(p, at::COPY_BOX, CopyBox, |s| s.stride[1] = 0))),
@@ -526,6 +539,23 @@ fn softmax_alone(channels: u16) -> ImageParts {
             exponent: s.exponent,
             exp_table: s.exp_table,
         })];
+    });
+    parts
+}
+
+/// One spatial softmax over an input.
+fn spatial_softmax_alone(shape: Shape) -> ImageParts {
+    let mut parts = softmax_alone(1);
+    let (input, output) = (2 * shape.elements() as u32, 8 * u32::from(shape.channels));
+    let points = Shape::tokens(shape.channels, 2);
+    parts.tensors[0] = TensorRecord { shape, bytes: input, ..parts.tensors[0] };
+    let (element, offset) = (ElementType::I32, input.next_multiple_of(16));
+    parts.tensors[1] = TensorRecord { element, shape: points, offset, bytes: output, ..parts.tensors[1] };
+    parts.arena_bytes = offset + output.next_multiple_of(16);
+    step!(parts, 0, Softmax, |s| {
+        let (exponent, exp_table) = (s.exponent, s.exp_table);
+        parts.steps =
+            vec![Step::SpatialSoftmax(SpatialSoftmax { input: s.input, output: s.output, exponent, exp_table })];
     });
     parts
 }

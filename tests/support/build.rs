@@ -1,9 +1,9 @@
 //! From a described network to an image, with the stored frames as calibration.
 
-use crate::golden::{self, Network};
-use model_compiler::frames::{ByteMap, Frame};
+use crate::golden::{self, Lbc, Network};
+use model_compiler::frames::{ByteMap, Frame, RealMap, views};
 use model_compiler::import::{ImportOptions, NamedTensors, import};
-use model_compiler::ir::{Graph, Shape};
+use model_compiler::ir::{Graph, InputKind, Shape};
 use model_compiler::memory_plan::PlanOptions;
 use model_compiler::passes::{PassOptions, optimize_with};
 use model_compiler::pipeline::{self, Compiled};
@@ -24,7 +24,11 @@ pub fn graph(tensors: NamedTensors) -> Graph {
 /// # Panics
 /// The checkpoint is refused.
 pub fn graph_with(tensors: NamedTensors, passes: PassOptions) -> Graph {
-    let mut graph = import("network", tensors, &ImportOptions::default()).unwrap_or_else(|e| panic!("{e}"));
+    optimized(tensors, &ImportOptions::default(), passes)
+}
+
+fn optimized(tensors: NamedTensors, options: &ImportOptions, passes: PassOptions) -> Graph {
+    let mut graph = import("network", tensors, options).unwrap_or_else(|e| panic!("{e}"));
     optimize_with(&mut graph, passes).unwrap_or_else(|e| panic!("{e}"));
     graph
 }
@@ -59,11 +63,22 @@ pub fn frames((height, width): (u16, u16)) -> Vec<Frame> {
         .collect()
 }
 
-/// The frames of a graph: of the size of its image input.
+/// The stored views of LBC, cropped to a network's resolution.
+pub fn views((height, width): (u16, u16)) -> Vec<Frame> {
+    let shape = Shape::map(height, width, views::CHANNELS);
+    let frame = |(i, full): (usize, &golden::Frame)| Frame {
+        name: format!("golden {i}"),
+        views: Some(RealMap { shape, data: full.cropped_views(height.into(), width.into()) }),
+        ..Frame::default()
+    };
+    golden::frames().iter().enumerate().map(frame).collect()
+}
+
+/// The frames of a graph: of the size of its image input, or of its views.
 pub fn frames_of(graph: &Graph) -> Vec<Frame> {
-    let (image, _) = graph.inputs().next().expect("a graph has inputs");
+    let (image, kind) = graph.inputs().next().expect("a graph has inputs");
     let shape = graph.value(image).shape;
-    frames((shape.height, shape.width))
+    if kind == InputKind::Views { views((shape.height, shape.width)) } else { frames((shape.height, shape.width)) }
 }
 
 /// Quantizes a graph on the stored frames.
@@ -90,6 +105,12 @@ pub fn compiled_for(model: &QModel, target: &str) -> Compiled {
     let target = Target::find(target).unwrap_or_else(|e| panic!("{e}"));
     let options = PlanOptions::for_target(&target);
     pipeline::compile(model, &target, &options, &mut |_, _, _| {}).unwrap_or_else(|e| panic!("{e}"))
+}
+
+/// LBC of any size, ready to compile; `hack` halves its views first.
+pub fn lbc(network: &Lbc, hack: bool) -> Graph {
+    let options = ImportOptions { hack, resolution: Some(network.resolution), ..Default::default() };
+    optimized(network.tensors(), &options, PassOptions::default())
 }
 
 /// A small network of a system, ready to compile.

@@ -2,9 +2,10 @@
 
 use crate::build;
 use crate::golden::{self, Network};
-use crate::torch_file::Saved;
+use crate::torch_file::{Py, Saved};
 use model_compiler::cli::Console;
-use model_compiler::frames::{ByteMap, Frame};
+use model_compiler::frames::views::LEVELS;
+use model_compiler::frames::{ByteMap, Frame, RealMap};
 use model_compiler::import::{NamedTensors, TensorData};
 use safetensors::Dtype;
 use safetensors::tensor::TensorView;
@@ -155,6 +156,21 @@ pub fn torch(tensors: &NamedTensors) -> Saved {
     Saved::of_types(&stored)
 }
 
+/// A checkpoint as PyTorch Lightning saves it: the weights among hyper-parameters and what training left.
+pub fn lightning(saved: Saved) -> Vec<u8> {
+    let path = Py::Call("pathlib", "PosixPath", vec![Py::str("/"), Py::str("data")]);
+    let wrapped = saved.wrap(|weights| {
+        Py::dict([
+            ("epoch", Py::Int(29)),
+            ("optimizer_states", Py::List(vec![Py::dict([("lr", Py::Float(2e-4))])])),
+            ("state_dict", weights),
+            ("hparams_name", Py::str("hparams")),
+            ("hyper_parameters", Py::dict([("hack", Py::Bool(true)), ("dataset_dir", path)])),
+        ])
+    });
+    wrapped.zip()
+}
+
 /// Frames as a `.safetensors` file of raw network inputs.
 ///
 /// # Panics
@@ -195,6 +211,25 @@ pub fn inputs_file(frames: &[Frame]) -> Vec<u8> {
         (*name, TensorView::new(*element, shape.clone(), data).expect("shape and data agree"))
     });
     safetensors::serialize(views, None).expect("names differ")
+}
+
+/// Frames of LBC as a `.safetensors` file of its raw input, 0..=1.
+///
+/// # Panics
+/// A frame lacks views.
+pub fn views_file(frames: &[Frame]) -> Vec<u8> {
+    let views = |frame: &Frame| frame.views.clone().expect("views");
+    let shape = views(&frames[0]).shape;
+    let planes = |frame: &Frame| {
+        let RealMap { data, shape } = views(frame);
+        let channels = usize::from(shape.channels);
+        let plane = |c: usize| data.iter().skip(c).step_by(channels).map(|v| v / LEVELS).collect::<Vec<_>>();
+        (0..channels).flat_map(plane).flat_map(f32::to_le_bytes).collect::<Vec<u8>>()
+    };
+    let data: Vec<u8> = frames.iter().flat_map(planes).collect();
+    let shape = vec![frames.len(), shape.channels.into(), shape.height.into(), shape.width.into()];
+    let view = TensorView::new(Dtype::F32, shape, &data).expect("shape and data agree");
+    safetensors::serialize([("lbc_input", view)], None).expect("one name")
 }
 
 /// A frame of a frame directory: `rgb.png`, `lidar.bin` with a few walls of points, `frame.json`.

@@ -31,7 +31,7 @@ const SIZE: u16 = 16;
 const LISTS: Shape = Shape::map(2, 2, 6);
 
 /// Names of all operators, as [`firmware::program::Step::name`] gives them.
-pub const OPERATORS: [&str; 18] = [
+pub const OPERATORS: [&str; 19] = [
     "conv2d",
     "linear",
     "max_pool",
@@ -50,6 +50,7 @@ pub const OPERATORS: [&str; 18] = [
     "gather_sum",
     "branch_linear",
     "sigmoid",
+    "spatial_softmax",
 ];
 
 /// The float network.
@@ -83,7 +84,8 @@ pub fn graph() -> Graph {
     let decoder = b.decoder();
     let waypoints = b.push("waypoints", decoder, &[hidden, goal]);
     let probabilities = b.classifier(image, lidar, bev);
-    b.graph.outputs.extend([waypoints, probabilities]);
+    let points = b.points(image);
+    b.graph.outputs.extend([waypoints, probabilities, points]);
     let controls = b.controls(features, lidar_normed, bev, command);
     b.graph.outputs.extend(controls);
     b.graph
@@ -284,6 +286,13 @@ impl Builder {
         [controls, gates, self.push("branch.counts", Op::Sigmoid, &[counts])]
     }
 
+    /// Logits enlarged in 16 bits, and the pixel that each map expects.
+    fn points(&mut self, image: ValueId) -> ValueId {
+        let logits = self.conv("points.logits", &[image], Window::square(1, 1, 0), 1, None, Clip::NONE);
+        let enlarged = self.push("points.enlarged", Op::ResizeBilinear { factor: (2, 3) }, &[logits]);
+        self.push("points", Op::SpatialSoftmax { temperature: 0.5 }, &[enlarged])
+    }
+
     fn decoder(&mut self) -> Op {
         Op::WaypointDecoder(WaypointDecoder {
             input_weights: self.weights(&[3 * CHANNELS, 2]),
@@ -302,7 +311,7 @@ mod tests {
     use super::*;
     use firmware::engine::Engine;
     use firmware::kernels::Portable;
-    use firmware::program::{Requant, Residual, Step};
+    use firmware::program::{Requant, Residual, ResizeBilinear, Step};
     use firmware::tensor::{ElementType, TensorId};
     use model_compiler::emit::emit;
 
@@ -344,6 +353,10 @@ mod tests {
         assert!(forms(&|s| matches!(s, Step::BranchLinear(s) if element(s.input) == ElementType::I8)));
         assert!(forms(&|s| matches!(s, Step::Sigmoid(s) if element(s.input) == ElementType::I16)));
         assert!(forms(&|s| matches!(s, Step::Sigmoid(s) if element(s.input) == ElementType::I8)));
+        let wide_enlargement = |s: &ResizeBilinear| {
+            [s.input.tensor, s.output].map(element) == [ElementType::I16; 2] && s.weight_bits == 11
+        };
+        assert!(forms(&|s| matches!(s, Step::ResizeBilinear(s) if wide_enlargement(s))), "logits stay in 16 bits");
         let in_place = parts.tensors.iter().filter(|tensor| tensor.in_place_of.is_some()).count();
         assert!(in_place >= 3, "{in_place} tensors in place");
     }

@@ -9,8 +9,10 @@ use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+pub mod lbc;
 pub mod network;
 
+pub use lbc::Lbc;
 pub use network::Network;
 
 /// Salt of the generated weights that the stored vectors belong to.
@@ -22,6 +24,9 @@ const FRAME_SIZE: usize = 256;
 /// Pixels per cell, and numbers in the list of a cell.
 const CELL: usize = 32;
 const LIST: usize = 10;
+
+/// Height and width of the stored views of LBC, pixels.
+pub const VIEWS: [usize; 2] = [144, 256];
 
 /// A file of `tests/golden`.
 pub fn path(file: &str) -> PathBuf {
@@ -144,6 +149,8 @@ pub struct Frame {
     pub bev_points: Vec<f32>,
     /// LiDAR cells of each image cell: `H×W×5` pairs.
     pub camera_points: Vec<f32>,
+    /// Views and heatmap of LBC, [`VIEWS`]`×10` grey levels.
+    pub views: Vec<f32>,
 }
 
 impl Frame {
@@ -175,6 +182,16 @@ impl Frame {
             ..self.clone()
         }
     }
+
+    /// The first rows and columns around the middle of the views.
+    ///
+    /// # Panics
+    /// The size exceeds the stored one.
+    pub fn cropped_views(&self, height: usize, width: usize) -> Vec<f32> {
+        let (top, left) = ((VIEWS[0] - height) / 2, (VIEWS[1] - width) / 2);
+        let row = |y: usize| &self.views[((top + y) * VIEWS[1] + left) * 10..][..width * 10];
+        (0..height).flat_map(row).copied().collect()
+    }
 }
 
 /// The stored frames.
@@ -189,6 +206,7 @@ pub fn frames() -> Vec<Frame> {
         let count = (FRAME_SIZE / CELL).pow(2) * LIST;
         words.skip(i * count).take(count).collect()
     };
+    let views = file.bytes("lbc_views");
     let frame = |i: usize| Frame {
         rgb: channels_last(&rgb, i, 3),
         bev: channels_last(&bev, i, 2),
@@ -197,6 +215,7 @@ pub fn frames() -> Vec<Frame> {
         command: i32::from_le_bytes(command[4 * i..][..4].try_into().expect("four bytes")),
         bev_points: lists(&bev_points, i),
         camera_points: lists(&camera_points, i),
+        views: lbc::views(&views, i),
     };
     (0..velocity.len()).map(frame).collect()
 }
@@ -212,7 +231,8 @@ fn channels_last(maps: &[u8], i: usize, channels: usize) -> Vec<f32> {
 #[derive(Clone, Debug)]
 pub struct Expected {
     /// Result to its values per frame: `waypoints` are `[right, forward-negative]`, m; of CILRS `steer`, `throttle`,
-    /// `brake` and `velocity`.
+    /// `brake` and `velocity`; of LBC `points`, `[x, y]` from −1 to 1, and mean and standard deviation over all pixels
+    /// of each map of logits, `logits_mean` and `logits_std` (temperature 5, without `hack`).
     pub results: BTreeMap<String, Vec<Vec<f32>>>,
     /// Module name to spatial mean per frame and channel (of a transformer: of its image tokens' part).
     pub taps: BTreeMap<String, Vec<Vec<f32>>>,
@@ -313,6 +333,7 @@ mod tests {
             (System::TransFuser, 0x9953_4b15),
             (System::GeometricFusion, 0xd579_3ed8),
             (System::Cilrs, 0xfdc5_b069),
+            (System::Lbc, 0x0497_a3a4),
         ] {
             assert_eq!(crc(&checkpoint(system)), expected, "{}", system.name());
         }
@@ -349,6 +370,8 @@ mod tests {
         assert_eq!(frames[2].target, [3.25, -45.0]);
         for frame in &frames {
             assert_eq!((frame.rgb.len(), frame.bev.len()), (256 * 256 * 3, 256 * 256 * 2));
+            assert_eq!(frame.views.len(), 144 * 256 * 10);
+            assert_eq!(frame.cropped_views(32, 64)[..10], frame.views[(56 * 256 + 96) * 10..][..10]);
             assert!(frame.rgb.iter().all(|v| (0.0..=255.0).contains(v)) && frame.rgb.iter().any(|&v| v > 100.0));
             assert!(frame.bev.iter().all(|v| (0.0..=5.0).contains(v)) && frame.bev.iter().any(|&v| v > 0.0));
             assert!((1..=6).contains(&frame.command));
@@ -372,6 +395,7 @@ mod tests {
             (System::TransFuser, 13, 8),
             (System::GeometricFusion, 9, 8),
             (System::Cilrs, 4, 4),
+            (System::Lbc, 0, 16),
         ] {
             let expected = expected(system);
             assert!(expected.results.values().all(|frames| frames.len() == 4));

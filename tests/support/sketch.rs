@@ -4,7 +4,8 @@ use firmware::image::layout::{header, region, tensor};
 use firmware::image::{Check, SectionKind, TensorRecord, layout};
 use firmware::program::{
     Add, Attention, AveragePool, BranchLinear, Clamp, ConstRange, Conv2d, CopyBox, KernelId, LayerNorm, Linear,
-    MaxPool, Requant, Requantize, Rescale, Residual, ResizeBilinear, Step, Term, TokenSource, Tokens, Window,
+    MaxPool, Requant, Requantize, Rescale, Residual, ResizeBilinear, SpatialSoftmax, Step, Term, TokenSource, Tokens,
+    Window,
 };
 use firmware::tensor::{ElementType, Shape, TensorId};
 use model_compiler::emit::{ImageParts, ImagePort, assemble, reseal};
@@ -467,6 +468,7 @@ fn of_operators() -> Vec<(Check, Vec<u8>)> {
         (Check::StepBorder, boxed([1, 1, 1], 200)),
         (Check::StepBranches, branched(0, false)),
         (Check::StepResidual, branched(2, true)),
+        (Check::StepPixels, wide_spatial_softmax()),
         (Check::Work, sealed(&work.finish(sums))),
     ]
 }
@@ -596,6 +598,17 @@ fn branched(branches: u16, residual: bool) -> Vec<u8> {
         rescale,
         scratch,
     }));
+    sealed(&sketch.finish(output))
+}
+
+/// One row of logits, a pixel longer than can be summed.
+fn wide_spatial_softmax() -> Vec<u8> {
+    let mut sketch = Sketch::default();
+    let input = sketch.tensor(ElementType::I16, Shape::map(1, 257, 1));
+    sketch.inputs.push(input);
+    let output = sketch.tensor(ElementType::I32, Shape::tokens(1, 2));
+    let exp_table = sketch.constant(2 * 257);
+    sketch.steps.push(Step::SpatialSoftmax(SpatialSoftmax { input, output, exponent: HALF, exp_table }));
     sealed(&sketch.finish(output))
 }
 

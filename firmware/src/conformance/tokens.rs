@@ -1,12 +1,12 @@
-//! Operators on tokens and the waypoint decoder. Tables fall and rise like the functions that they stand for, but are
-//! straight lines: a backend must read them, not know them.
+//! Operators on tokens, the softmaxes, the sigmoid and the waypoint decoder. Tables fall and rise like the functions that
+//! they stand for, but are straight lines: a backend must read them, not know them.
 
 use super::draw::Draw;
 use super::{Case, Difference, Outcome, first_difference};
 use crate::fixed_point::{EXP_TABLE_LEN, TANH_TABLE_LEN};
 use crate::kernels::{
-    AttentionArgs, Kernels, LayerNormArgs, Portable, SigmoidArgs, SoftmaxArgs, TokenSourceArgs, TokensArgs,
-    WaypointDecoderArgs, plan,
+    AttentionArgs, Kernels, LayerNormArgs, Portable, SigmoidArgs, SoftmaxArgs, SpatialSoftmaxArgs, TokenSourceArgs,
+    TokensArgs, WaypointDecoderArgs, plan,
 };
 use crate::program::Requant;
 use crate::tensor::{Codes, CodesMut, ElementType, Shape, index};
@@ -151,6 +151,27 @@ fn tanh_table<'m>(draw: &mut Draw<'m>) -> Option<&'m [i16]> {
         *entry = k.saturating_mul(256);
     }
     Some(table)
+}
+
+/// Small maps, and the longest row and column.
+pub(super) fn spatial_softmax(case: &mut Case<'_>, number: u32) -> Outcome {
+    let draw = &mut case.draw;
+    let channels = u16::try_from(number % 9 + 1).ok()?;
+    let shape = match number % 50 {
+        0 => Shape::map(256, 2, channels),
+        1 => Shape::map(2, 256, channels),
+        _ => Shape::map(draw.size(1, 20), draw.size(1, 20), channels),
+    };
+    let exponent = Requant { multiplier: draw.multiplier(), shift: draw.byte(8, 36) };
+    let args = SpatialSoftmaxArgs { shape, exponent, exp_table: exp_table(draw)? };
+    let logits: &[i16] = draw.values(usize::try_from(shape.elements()).ok()?, i16::MIN.into(), i16::MAX.into())?;
+    case.describe(format_args!("{shape:?}"));
+    let (mut expected, mut found) = ([0x5555; 18], [0x5555; 18]);
+    let points = 2 * usize::from(channels);
+    Portable.spatial_softmax(&args, logits, expected.get_mut(..points)?);
+    case.kernels.spatial_softmax(&args, logits, found.get_mut(..points)?);
+    let difference: Option<Difference> = first_difference(&found, &expected, points);
+    Some(difference.map_or(Ok(points), Err))
 }
 
 /// Both forms of the goal.

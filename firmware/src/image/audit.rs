@@ -178,6 +178,7 @@ impl<'a> Auditor<'_, 'a> {
             Step::Attention(step) => self.within::<i16>(Array::ExpTable, step.exp_table, 0..=i16::MAX.into()),
             Step::Softmax(step) => self.within::<i16>(Array::ExpTable, step.exp_table, 0..=i16::MAX.into()),
             Step::Sigmoid(step) => self.within::<i16>(Array::TanhTable, step.tanh_table, 0..=i16::MAX.into()),
+            Step::SpatialSoftmax(step) => self.within::<i16>(Array::ExpTable, step.exp_table, 0..=i16::MAX.into()),
             Step::WaypointDecoder(step) => {
                 self.within::<u8>(Array::Shifts, step.shifts, 0..=30)?;
                 self.within::<i16>(Array::TanhTable, step.tanh_table, 0..=i16::MAX.into())

@@ -121,6 +121,7 @@ checks! {
     StepBorder: "the code of the border is outside the element type",
     StepBranches: "the number of branches is out of range",
     StepResidual: "the operator has no second term",
+    StepPixels: "more rows or columns than the operator can sum exactly",
     Work: "the program would run too long",
 }
 

@@ -20,6 +20,7 @@ mod product;
 pub mod resize_bilinear;
 pub mod sigmoid;
 pub mod softmax;
+pub mod spatial_softmax;
 pub mod tokens;
 pub mod waypoint_decoder;
 mod windows;

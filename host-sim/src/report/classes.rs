@@ -25,7 +25,7 @@ pub(super) fn run(report: &RunReport) -> String {
     };
     let seen = report.frames.iter().filter_map(|frame| match &frame.output {
         Output::Class(seen) => Some((&frame.name, seen)),
-        Output::Waypoints { .. } | Output::Controls(_) => None,
+        Output::Waypoints { .. } | Output::Controls(_) | Output::Points { .. } => None,
     });
     let mut text = String::new();
     if report.frames.len() <= LONGEST_TABLE {

@@ -77,8 +77,14 @@ mod tests {
     #[test]
     fn errors_have_their_names() {
         assert_eq!(words(&verify(&errors()))[0], "steer 0.1250 off on average, 0.2500 at most");
-        let fidelity =
-            Fidelity { vector_sqnr_db: 30.0, mean_mm: vec![], worst_mm: vec![], controls: errors(), classes: None };
+        let fidelity = Fidelity {
+            vector_sqnr_db: 30.0,
+            mean_mm: vec![],
+            worst_mm: vec![],
+            controls: errors(),
+            points: None,
+            classes: None,
+        };
         let found = words(&ablation(&[Row { variant: "8-bit maps", fidelity }]));
         assert!(found[0].starts_with("variant vector dB mean steer mean throttle"), "{found:?}");
         assert!(found[1].starts_with("8-bit maps 30.00 0.1250 0.0000"), "{found:?}");

@@ -23,6 +23,7 @@ mod maps;
 mod memory;
 mod noise;
 mod plot;
+mod points;
 mod steps;
 mod summary;
 mod tensors;
@@ -46,6 +47,7 @@ pub fn page(report: &VerifyReport, frames: &[Frame]) -> String {
         (memory::section(&report.memory, &report.summary))
         (waypoints::section(&report.frames, frames))
         (controls::section(&report.frames))
+        (points::section(&report.frames, frames))
         (classes::section(report.summary.accuracy.as_ref(), &report.frames))
         (frames::section(&report.frames))
         (steps::section(&report.steps))

@@ -20,35 +20,41 @@ pub use score::score;
 /// Changed steps that a terminal shows.
 const MAX_CHANGES: usize = 20;
 
-/// Waypoints, controls or classes of every frame.
+/// Waypoints, controls, points or classes of every frame.
 pub fn run(report: &RunReport) -> String {
     let head = format!("{} (sha256 {}…)", report.model.name, &report.model.sha256[..16]);
-    let waypoints = |frame: &FrameResult| match &frame.output {
-        Output::Waypoints { waypoints } => Some((frame.name.clone(), waypoints.clone())),
+    let pairs = |frame: &FrameResult| match &frame.output {
+        Output::Waypoints { waypoints: pairs } | Output::Points { points: pairs } => {
+            Some((frame.name.clone(), pairs.clone()))
+        }
         Output::Controls(_) | Output::Class(_) => None,
     };
     let given = report.frames.iter().filter_map(|frame| match &frame.output {
         Output::Controls(prediction) => Some((frame.name.as_str(), prediction)),
-        Output::Waypoints { .. } | Output::Class(_) => None,
+        Output::Waypoints { .. } | Output::Points { .. } | Output::Class(_) => None,
     });
     let given: Vec<_> = given.collect();
     if !given.is_empty() {
         return format!("{head}, controls as the network gives them\n\n{}", controls::run(&given));
     }
-    let driven: Vec<(String, Waypoints)> = report.frames.iter().filter_map(waypoints).collect();
+    let driven: Vec<(String, Waypoints)> = report.frames.iter().filter_map(pairs).collect();
     if driven.is_empty() {
         return format!("{head}\n\n{}", classes::run(report));
     }
-    let longest = driven.iter().map(|(_, waypoints)| waypoints.len()).max().unwrap_or(0);
-    let header = ["frame".to_owned()]
-        .into_iter()
-        .chain((1..=longest).flat_map(|k| [format!("right {k}"), format!("forward {k}")]));
-    let row = |(name, waypoints): &(String, Waypoints)| {
-        let meters = waypoints.iter().flatten().map(|meters| format!("{meters:.3}"));
-        [name.clone()].into_iter().chain(meters).collect()
+    let points = report.frames.iter().any(|frame| matches!(frame.output, Output::Points { .. }));
+    let (axes, unit) = match points {
+        true => (["x", "y"], "points from −1 (left, top) to 1 (right, bottom)"),
+        false => (["right", "forward"], "waypoints in meters"),
+    };
+    let longest = driven.iter().map(|(_, pairs)| pairs.len()).max().unwrap_or(0);
+    let columns = (1..=longest).flat_map(|k| axes.map(|axis| format!("{axis} {k}")));
+    let header = ["frame".to_owned()].into_iter().chain(columns);
+    let row = |(name, pairs): &(String, Waypoints)| {
+        let values = pairs.iter().flatten().map(|value| format!("{value:.3}"));
+        [name.clone()].into_iter().chain(values).collect()
     };
     let table = table(header.collect(), &[0], driven.iter().map(row));
-    format!("{head}, waypoints in meters\n\n{table}\n")
+    format!("{head}, {unit}\n\n{table}\n")
 }
 
 /// The steps and the summary of a verification.
@@ -92,12 +98,18 @@ pub fn ablation(rows: &[Row]) -> String {
     if rows.iter().any(|row| !row.fidelity.controls.is_empty()) {
         return controls::ablation(rows);
     }
-    let waypoints = rows.first().map_or(0, |row| row.fidelity.mean_mm.len());
-    let numbered = |what: &str| (1..=waypoints).map(|k| format!("{what} mm {k}")).collect::<Vec<_>>();
-    let header = [vec!["variant".to_owned(), "vector dB".to_owned()], numbered("mean"), numbered("worst")].concat();
+    let points = rows.iter().any(|row| row.fidelity.points.is_some());
+    let (vector, unit, digits) = if points { ("logits dB", "px", 2) } else { ("vector dB", "mm", 0) };
+    let errors = |row: &Row| match &row.fidelity.points {
+        Some(points) => [points.mean_px.clone(), points.worst_px.clone()],
+        None => [row.fidelity.mean_mm.clone(), row.fidelity.worst_mm.clone()],
+    };
+    let count = rows.first().map_or(0, |row| errors(row)[0].len());
+    let numbered = |what: &str| (1..=count).map(|k| format!("{what} {unit} {k}")).collect::<Vec<_>>();
+    let header = [vec!["variant".to_owned(), vector.to_owned()], numbered("mean"), numbered("worst")].concat();
     let line = |row: &Row| {
-        let millimeters = row.fidelity.mean_mm.iter().chain(&row.fidelity.worst_mm).map(|mm| format!("{mm:.0}"));
-        [row.variant.to_owned(), figure(row.fidelity.vector_sqnr_db.into(), 2)].into_iter().chain(millimeters).collect()
+        let errors = errors(row).concat().into_iter().map(|error| format!("{error:.digits$}"));
+        [row.variant.to_owned(), figure(row.fidelity.vector_sqnr_db.into(), 2)].into_iter().chain(errors).collect()
     };
     format!("{}\n", table(header, &[0], rows.iter().map(line)))
 }
@@ -144,6 +156,15 @@ pub fn summary(report: &VerifyReport) -> String {
         );
     }
     text += &controls::verify(&s.control_error);
+    for (k, error) in s.point_error_px.iter().enumerate() {
+        let _ = writeln!(
+            text,
+            "point {}                {:.2} px off on average, {:.2} px at most",
+            k + 1,
+            error.mean,
+            error.max
+        );
+    }
     text += &s.accuracy.as_ref().map(classes::verify).unwrap_or_default();
     let _ = writeln!(
         text,
@@ -167,6 +188,7 @@ pub fn diff(diff: &Diff) -> String {
     let digits = |unit: &str| match unit {
         "B" => 0,
         "" => controls::DIGITS,
+        "px" => 2,
         _ => 1,
     };
     let row = |change: &FigureChange| {
@@ -242,6 +264,20 @@ mod tests {
         assert!(lines[1].ends_with("14.250") && lines[2].ends_with("14.250"));
         assert_eq!(lines[1].len(), lines[2].len(), "{text}");
         assert!(text.starts_with("mini (sha256 abababababababab…)"));
+    }
+
+    #[test]
+    fn points_stand_in_columns_and_their_errors_in_pixels() {
+        let model = ModelInfo { name: "mini".into(), sha256: "ab".repeat(32) };
+        let output = Output::Points { points: vec![[-0.5, 1.0], [0.25, 0.0]] };
+        let text = run(&RunReport::new(model, vec![FrameResult { name: "a".into(), output }]));
+        assert!(text.starts_with("mini (sha256 abababababababab…), points from −1 (left, top)"), "{text}");
+        let words: Vec<Vec<&str>> = text.lines().skip(2).map(|line| line.split_whitespace().collect()).collect();
+        assert_eq!(words[0], ["frame", "x", "1", "y", "1", "x", "2", "y", "2"]);
+        assert_eq!(words[1], ["a", "-0.500", "1.000", "0.250", "0.000"]);
+        let mut report = super::super::tests::report();
+        report.summary.point_error_px = vec![super::super::MeanAndMax { mean: 0.25, max: 1.5 }];
+        assert!(summary(&report).contains("point 1                0.25 px off on average, 1.50 px at most"));
     }
 
     #[test]

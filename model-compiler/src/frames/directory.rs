@@ -1,12 +1,15 @@
-//! Frame directories: one folder per frame with camera image, LiDAR points and a small description.
+//! Frame directories: one folder per frame with camera images, LiDAR points and a small description.
 
-use super::{Frame, FrameFormat, bev, camera, correspondence};
+use super::{Frame, FrameFormat, RealMap, bev, camera, correspondence, views};
 use crate::error::{Error, ErrorCode, Result};
 use bev::LidarAxes;
+use firmware::tensor::Shape;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
 const IMAGE: &str = "rgb.png";
+/// The cameras of LBC: front, left, right.
+const VIEWS: [&str; 3] = [IMAGE, "rgb_left.png", "rgb_right.png"];
 const LIDAR: &str = "lidar.bin";
 const DESCRIPTION: &str = "frame.json";
 const DESCRIPTION_HELP: &str =
@@ -60,6 +63,7 @@ fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
         bev,
         velocity: format.velocity.then(|| description.number("speed")).transpose()?,
         goal: format.goal.then(|| description.goal()).transpose()?,
+        views: format.views.map(|shape| read_views(folder, shape, &description)).transpose()?,
         command: description.command(format.command)?,
         bev_points,
         camera_points,
@@ -68,7 +72,23 @@ fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
     })
 }
 
-fn wrong_histogram_size(folder: &Path, shape: firmware::tensor::Shape) -> Error {
+/// The views of LBC, cropped to the network's size, and the heatmap of the goal.
+fn read_views(folder: &Path, shape: Shape, description: &Description) -> Result<RealMap> {
+    if shape.channels != views::CHANNELS {
+        let message = format!(
+            "the network reads {} channels, frame folders give {}: three views and a heatmap",
+            shape.channels,
+            views::CHANNELS
+        );
+        let error = Error::new(ErrorCode::Frames, folder.display().to_string(), message);
+        return Err(error.with_help("feed it with a .safetensors file"));
+    }
+    let load = |file: &str| camera::load(&folder.join(file), Shape::map(shape.height, shape.width, 3));
+    let [front, left, right] = VIEWS.map(load);
+    Ok(views::join(&[front?, left?, right?], description.goal()?))
+}
+
+fn wrong_histogram_size(folder: &Path, shape: Shape) -> Error {
     let message = format!(
         "the network reads a {}×{}×{} histogram, frame folders give powers of two up to 1024 and 2 channels",
         shape.height, shape.width, shape.channels
@@ -175,7 +195,6 @@ fn as_f32_range(value: &Value) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::ir::InputKind;
-    use firmware::tensor::Shape;
     use std::fs;
 
     const GOOD: &str = r#"{"speed": 4.5, "goal": [1.5, 25], "command": 4}"#;
@@ -299,6 +318,28 @@ mod tests {
         assert!(frame.bev.is_none() && frame.velocity.is_none() && frame.command.is_none());
         let message = load(root.path(), &FrameFormat { command: true, ..aim }).unwrap_err().to_string();
         assert!(message.contains("frame.json: `command`: missing, expected 1..6"), "{message}");
+    }
+
+    #[test]
+    fn the_views_of_lbc_are_joined_with_the_heatmap_of_the_goal() {
+        let root = directory(r#"{"goal": [0, 46.5]}"#);
+        let folder = root.path().join("one");
+        let save = |file: &str, level: u8| {
+            image::RgbImage::from_pixel(4, 4, image::Rgb([level; 3])).save(folder.join(file)).unwrap();
+        };
+        save(VIEWS[1], 50);
+        let lbc = |channels| FrameFormat::new("lbc", [(InputKind::Views, Shape::map(2, 4, channels))]);
+        let message = load(root.path(), &lbc(10)).unwrap_err().to_string();
+        assert!(message.contains("rgb_right.png"), "{message}");
+        save(VIEWS[2], 70);
+        let frame = load(root.path(), &lbc(10)).unwrap().remove(0);
+        let views = frame.views.as_ref().unwrap();
+        // The second row of four; the target is beyond the last pixel.
+        assert_eq!(views.data[..9], [0.0, 1.0, 9.0, 50.0, 50.0, 50.0, 70.0, 70.0, 70.0]);
+        assert_eq!(views.data[79], 255.0);
+        assert_eq!((frame.rgb.is_none(), frame.raw(InputKind::Views).unwrap().len()), (true, 80));
+        let message = load(root.path(), &lbc(9)).unwrap_err().to_string();
+        assert!(message.contains("the network reads 9 channels, frame folders give 10"), "{message}");
     }
 
     /// Another axis convention and sensor height, the same scene: the golden histogram was made from this very sweep.

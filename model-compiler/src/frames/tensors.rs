@@ -1,11 +1,12 @@
 //! Ready network inputs in a `.safetensors` file: `rgb` u8 `[N,3,H,W]`, `bev` u8 `[N,2,H,W]` (counts 0..=5), `velocity`
-//! f32 `[N]`, `target` f32 `[N,2]` (network frame), `command` i32 `[N]` (1..=6), `bev_points` and `cam_points` i32
-//! `[N,H,W,K,2]` (cells that see the same points).
+//! f32 `[N]`, `target` f32 `[N,2]` (network frame), `lbc_input` f32 `[N,10,H,W]` (views and heatmap, 0..=1), `command`
+//! i32 `[N]` (1..=6), `bev_points` and `cam_points` i32 `[N,H,W,K,2]` (cells that see the same points).
 //!
 //! Of a classifier: the image by the network's own name for it, or as `rgb`, `[N,C,H,W]`, and optionally `label` i64
 //! `[N]`. Images may be f32 as well; they are raw, so every value is a whole number 0..=255.
 
-use super::{ByteMap, Frame, FrameFormat, Label, bev};
+use super::views::LEVELS;
+use super::{ByteMap, Frame, FrameFormat, Label, RealMap, bev};
 use crate::error::{Error, ErrorCode, Result};
 use firmware::tensor::Shape;
 use safetensors::{Dtype, SafeTensors, tensor::TensorView};
@@ -35,6 +36,7 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
     let points = |batch: &mut Batch<'_>, name| format.points.map(|shape| batch.cells(name, shape)).transpose();
     let (bev_points, camera_points) = (points(&mut batch, "bev_points")?, points(&mut batch, "cam_points")?);
     let command = batch.commands(format.command)?;
+    let views = format.views.map(|shape| batch.views("lbc_input", shape)).transpose()?;
     let count = batch.frames.unwrap_or(0);
     let labels = format.classes.map(|classes| batch.labels(classes)).transpose()?.flatten();
     if count == 0 {
@@ -46,6 +48,7 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
         bev: bev.as_ref().map(|maps| maps[i].clone()),
         velocity: velocity.as_ref().map(|v| f64::from(v[i])),
         goal: goal.as_ref().map(|g| [f64::from(g[2 * i]), f64::from(g[2 * i + 1])]),
+        views: views.as_ref().map(|maps| maps[i].clone()),
         command: command.as_ref().map(|c| c[i]),
         bev_points: bev_points.as_ref().map(|maps| maps[i].clone()),
         camera_points: camera_points.as_ref().map(|maps| maps[i].clone()),
@@ -113,12 +116,21 @@ impl<'a> Batch<'a> {
             true => grey_levels(name, &self.floats(name, &per_frame)?)?.into(),
             false => Cow::Borrowed(self.tensor(name, Dtype::U8, &per_frame)?.data()),
         };
-        let plane = height * width;
-        let channel_fastest = |planes: &[u8]| {
-            let data = (0..plane).flat_map(|p| (0..channels).map(move |c| planes[c * plane + p])).collect();
-            ByteMap { shape, data }
-        };
-        Ok(planes.chunks_exact(channels * plane).map(channel_fastest).collect())
+        let maps = planes.chunks_exact(channels * height * width);
+        Ok(maps.map(|planes| ByteMap { shape, data: channel_fastest(planes, channels) }).collect())
+    }
+
+    /// `[N][C][H][W]` of values 0..=1 to a map of grey levels per frame.
+    fn views(&mut self, name: &str, shape: Shape) -> Result<Vec<RealMap>> {
+        let [height, width, channels] = [shape.height, shape.width, shape.channels].map(usize::from);
+        let values = self.floats(name, &[channels, height, width])?;
+        if let Some(value) = values.iter().find(|value| !(0.0..=1.0).contains(*value)) {
+            return Err(tensor_error(name, format!("holds {value}, expected values 0..=1"))
+                .with_help("grey levels are divided by 255, as the network reads them"));
+        }
+        let levels: Vec<f32> = values.iter().map(|value| value * LEVELS).collect();
+        let maps = levels.chunks_exact(channels * height * width);
+        Ok(maps.map(|planes| RealMap { shape, data: channel_fastest(planes, channels) }).collect())
     }
 
     /// `[N][H][W][K][2]` cells of a map as large, to a map of pairs per frame.
@@ -183,6 +195,12 @@ impl<'a> Batch<'a> {
             Err(value) => Err(tensor_error("command", format!("holds {value}, expected 1..=6"))),
         }
     }
+}
+
+/// `[C][H][W]` to `[H][W][C]`.
+fn channel_fastest<T: Copy>(planes: &[T], channels: usize) -> Vec<T> {
+    let plane = planes.len() / channels;
+    (0..plane).flat_map(|p| (0..channels).map(move |c| planes[c * plane + p])).collect()
 }
 
 fn grey_levels(name: &str, values: &[f32]) -> Result<Vec<u8>> {

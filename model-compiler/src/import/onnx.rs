@@ -56,6 +56,8 @@ pub fn import(model: &Model, folder: Option<&Path>, options: &ImportOptions) -> 
         ("--system", options.system.is_some()),
         ("--heads", options.heads.is_some()),
         ("--fusion-scales", options.fusion_scales.is_some()),
+        ("--hack", options.hack),
+        ("--temperature", options.temperature.is_some()),
     ] {
         if is_given {
             return Err(Error::new(ErrorCode::Usage, "", format!("{option} has no effect on an ONNX file"))

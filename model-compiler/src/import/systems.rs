@@ -9,12 +9,15 @@ use crate::ir::Graph;
 use builder::Builder;
 
 mod aim;
+mod bottleneck;
 mod builder;
 mod cilrs;
+mod deeplab;
 mod detect;
 mod geometric_fusion;
 mod head;
 mod late_fusion;
+mod lbc;
 mod resnet;
 mod transformer;
 mod transfuser;
@@ -33,7 +36,7 @@ fn has(tensors: &NamedTensors, prefix: &str) -> bool {
 /// The system of these names. The order matters: some systems' names include those of a simpler one.
 pub(super) fn detect(tensors: &NamedTensors) -> Option<System> {
     let recognized: [(System, bool); 7] = [
-        (System::Lbc, has(tensors, "net.network.backbone.")),
+        (System::Lbc, lbc::recognize(tensors)),
         (System::Cilrs, cilrs::recognize(tensors)),
         // Its convolutions are named like those of Geometric Fusion.
         (System::TransFuser, transformer::is_shared(tensors)),
@@ -53,16 +56,16 @@ pub(super) fn build(system: System, name: &str, tensors: NamedTensors, options: 
         System::TransFuser => transfuser::build,
         System::GeometricFusion => geometric_fusion::build,
         System::Cilrs => cilrs::build,
-        System::Lbc => {
-            let message = format!("this is a checkpoint of {}, which is not supported", system.name());
-            return Err(Error::new(ErrorCode::Unsupported, "", message)
-                .with_help("supported are aim, late_fusion, transfuser, geometric_fusion and cilrs"));
-        }
+        System::Lbc => lbc::build,
     };
     if options.fusion_scales.is_some() && system != System::GeometricFusion {
         let message = format!("--fusion-scales has no effect on {}", system.name());
         return Err(Error::new(ErrorCode::Usage, "", message)
             .with_help("leave it out; the tensors of other systems tell their scales"));
+    }
+    if system != System::Lbc && (options.hack || options.temperature.is_some()) {
+        let message = format!("--hack and --temperature have no effect on {}", system.name());
+        return Err(Error::new(ErrorCode::Usage, "", message).with_help("leave them out; they belong to lbc"));
     }
     let mut builder = Builder::new(name, system, tensors, options);
     let built = recipe(&mut builder);

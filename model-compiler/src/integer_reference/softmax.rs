@@ -1,4 +1,4 @@
-//! Softmax over channels, and the base-2 exponential from a table that attention shares.
+//! Softmax over channels, and the base-2 exponential from a table that attention and the spatial softmax share.
 
 use super::arithmetic::{Exactness, RoundingShift, bits, power_of_two, quotient, to_f64};
 use super::operands::{Operands, expect};
@@ -60,13 +60,25 @@ impl Exponential {
 
     /// `e = 2^-u` (Q15) of a distance from the largest logit.
     fn weight(&self, distance: f64, exact: &mut Exactness) -> f64 {
+        let (whole, value) = self.split(distance, exact);
+        RoundingShift::new(8 + (whole as u32).min(23)).round(value, exact)
+    }
+
+    /// The same in Q23.
+    pub(super) fn fine_weight(&self, distance: f64, exact: &mut Exactness) -> f64 {
+        let (whole, value) = self.split(distance, exact);
+        RoundingShift::new(whole as u32).round(value, exact)
+    }
+
+    /// The whole powers of two of a distance, and `(T[k]<<8) − (T[k]−T[k+1])·r` of the rest.
+    fn split(&self, distance: f64, exact: &mut Exactness) -> (f64, f64) {
         let u = self.shift.round(distance * self.multiplier, exact).min(LARGEST_EXPONENT);
         let whole = (u * power_of_two(-16)).floor();
         let fraction = u - whole * power_of_two(16);
         let entry = (fraction * power_of_two(-8)).floor();
         let rest = fraction - entry * power_of_two(8);
         let (value, drop) = self.table[entry as usize];
-        RoundingShift::new(8 + (whole as u32).min(23)).round(value * 256.0 - drop * rest, exact)
+        (whole, value * 256.0 - drop * rest)
     }
 }
 

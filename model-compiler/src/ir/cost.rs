@@ -87,7 +87,8 @@ impl Op {
             | Self::Concat(_)
             | Self::Softmax
             | Self::GatherSum
-            | Self::Sigmoid => Vec::new(),
+            | Self::Sigmoid
+            | Self::SpatialSoftmax { .. } => Vec::new(),
         }
     }
 }

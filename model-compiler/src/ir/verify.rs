@@ -7,7 +7,8 @@ use std::collections::HashSet;
 ///
 /// * handles are in range; each value is written at most once, and read only after it was written
 /// * the output shapes are those that the operators give; no dimension is zero
-/// * constants have as many elements as their shape says and are finite; variances and deviations are positive
+/// * constants have as many elements as their shape says and are finite; variances, deviations and temperatures are
+///   positive
 /// * every value has a name of its own, and its node has the same
 /// * there are outputs, and they are written
 ///
@@ -107,6 +108,11 @@ impl Checklist<'_> {
             && !pad.value.is_finite()
         {
             self.error(node, format!("border value {}", pad.value));
+        }
+        if let Op::SpatialSoftmax { temperature } = node.op
+            && !(temperature.is_finite() && temperature > 0.0)
+        {
+            self.error(node, format!("temperature {temperature}"));
         }
         let (what, divisors) = match &node.op {
             Op::BatchNorm(bn) => ("variance + ε", bn.variance.iter().map(|v| v + bn.epsilon).collect()),
@@ -211,6 +217,10 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
         Op::Clip(_) | Op::Softmax | Op::Sigmoid => {
             arity(op, inputs, 1..=1)?;
             Ok(inputs[0])
+        }
+        Op::SpatialSoftmax { .. } => {
+            arity(op, inputs, 1..=1)?;
+            Ok(Shape::tokens(inputs[0].channels, 2))
         }
         Op::Add { .. } => {
             arity(op, inputs, 2..=2)?;

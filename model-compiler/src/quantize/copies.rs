@@ -51,7 +51,9 @@ pub(super) fn share_storage(graph: &Graph, roles: &[Role], types: &mut [Stored])
 
 /// Whether the step of an operator bounds its output.
 fn has_bounds(op: &Op) -> bool {
-    !is_copy(op) && !matches!(op, Op::Input(_) | Op::Softmax | Op::Sigmoid | Op::WaypointDecoder(_))
+    let is_fixed =
+        matches!(op, Op::Input(_) | Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. } | Op::WaypointDecoder(_));
+    !is_copy(op) && !is_fixed
 }
 
 /// The values whose storage must also hold the border of a pad behind them, each with the padded value.

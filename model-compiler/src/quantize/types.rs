@@ -2,15 +2,16 @@
 //!
 //! | value | type |
 //! |---|---|
-//! | image, BEV, cells to gather | i8 codes with the fixed scales of the numerics page |
+//! | image, views and their average pools, BEV, cells to gather | i8 codes with the fixed scales of the numerics page |
 //! | feature maps, LayerNorm outputs, attention context, MLP hidden | i8 affine |
 //! | queries, keys, values | i8 symmetric |
 //! | residual stream of a transformer | i16, one scale for all its taps |
 //! | skip values of the ResNets | i8 affine, or i16 per stage |
-//! | global pools and the vectors behind them, vectors behind the velocity, what a softmax or sigmoid reads | i16 |
+//! | global pools and the vectors behind them, vectors behind the velocity | i16 |
+//! | what a softmax or sigmoid reads (before an enlargement, too) | i16 |
 //! | probabilities, results of a sigmoid | i16, scale 2^-15 |
 //! | GRU start state | i16, a power of two |
-//! | velocity, goal, command, waypoints | fixed point |
+//! | velocity, goal, command, waypoints, points | fixed point |
 //!
 //! Pools, slices and pads copy codes, so what they give is stored like what they read (`copies`).
 
@@ -113,6 +114,8 @@ pub(super) enum Role {
     Waypoints,
     /// Results of a softmax or sigmoid.
     Probabilities,
+    /// Results of a spatial softmax.
+    Points,
 }
 
 /// Decides the storage of every value.
@@ -130,7 +133,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
         let seen = statistics.of(*borders.get(&id).unwrap_or(&id));
         let narrow = || Stored::i8(affine_i8(seen, options.ranges));
         types.push(match *role {
-            Role::Input(InputKind::Image) => Stored::fixed(ElementType::I8, 1.0, -128),
+            Role::Input(InputKind::Image | InputKind::Views) => Stored::fixed(ElementType::I8, 1.0, -128),
             Role::Input(InputKind::Bev) => Stored::fixed(ElementType::I8, 0.2, 0),
             Role::Input(InputKind::BevPoints | InputKind::CameraPoints) => Stored::fixed(ElementType::I8, 1.0, 0),
             Role::Input(InputKind::Command) => Stored::fixed(ElementType::I8, 1.0, 0),
@@ -145,6 +148,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
             Role::Vector => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
             Role::Hidden => hidden_state(seen.max_abs()),
             Role::Probabilities => Stored::fixed(ElementType::I16, f64::exp2(-15.0), 0),
+            Role::Points => Stored::fixed(ElementType::I32, f64::exp2(-6.0), 0),
         });
     }
     copies::share_storage(graph, &roles, &mut types);
@@ -195,9 +199,15 @@ fn roles(graph: &Graph) -> Vec<Role> {
             Op::ResizeBilinear { .. } if node.inputs.len() == 2 => Role::Skip,
             Op::GlobalPool => Role::Vector,
             Op::AveragePool(_) if graph.value(node.output).shape.positions() == 1 => Role::Vector,
+            // A mean of grey levels is one, and what stands for padding behind it must have a code, too.
+            Op::AveragePool(_) => match of(0) {
+                Some(grey @ Role::Input(InputKind::Image | InputKind::Views)) => grey,
+                _ => Role::Narrow,
+            },
             Op::Concat(_) if (0..node.inputs.len()).any(wide) => Role::Vector,
             Op::Slice(_) | Op::Pad(_) | Op::Clip(_) if of(0) == Some(Role::Vector) => Role::Vector,
             Op::Softmax | Op::Sigmoid => Role::Probabilities,
+            Op::SpatialSoftmax { .. } => Role::Points,
             Op::WaypointDecoder(_) => Role::Waypoints,
             _ => Role::Narrow,
         };
@@ -210,17 +220,26 @@ fn roles(graph: &Graph) -> Vec<Role> {
                 (Op::Attention { .. }, Role::Narrow) => *role = Role::Symmetric,
                 (Op::WaypointDecoder(_), _) => *role = Role::Hidden,
                 (Op::Attention { .. }, _) => {}
-                (Op::Softmax | Op::Sigmoid, Role::Narrow | Role::Skip) => *role = Role::Vector,
-                (Op::Softmax | Op::Sigmoid, _) => {}
+                (Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. }, Role::Narrow | Role::Skip) => {
+                    *role = Role::Vector;
+                }
+                (Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. }, _) => {}
                 (_, Role::Narrow) => *role = Role::Skip,
                 _ => {}
             }
         }
     }
-    // What a copy's reader asks for, its operand must give.
-    for node in graph.nodes.iter().rev().filter(|node| copies::is_copy(&node.op)) {
-        let (result, operand) = (roles[node.output.0 as usize], &mut roles[node.inputs[0].0 as usize]);
-        if *operand == Role::Narrow && matches!(result, Role::Symmetric | Role::Hidden | Role::Skip | Role::Vector) {
+    // What a copy's reader asks for, its operand must give; of an enlargement that holds for 16 bits.
+    for node in graph.nodes.iter().rev() {
+        let result = roles[node.output.0 as usize];
+        let asks = match &node.op {
+            op if copies::is_copy(op) => {
+                matches!(result, Role::Symmetric | Role::Hidden | Role::Skip | Role::Vector)
+            }
+            Op::ResizeBilinear { .. } => node.inputs.len() == 1 && result == Role::Vector,
+            _ => false,
+        };
+        if asks && let operand @ Role::Narrow = &mut roles[node.inputs[0].0 as usize] {
             *operand = result;
         }
     }
@@ -231,7 +250,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
 fn promoted(node: &Node) -> Vec<ValueId> {
     match &node.op {
         Op::Attention { .. } => node.inputs.clone(),
-        Op::WaypointDecoder(_) | Op::Softmax | Op::Sigmoid => vec![node.inputs[0]],
+        Op::WaypointDecoder(_) | Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. } => vec![node.inputs[0]],
         Op::Conv2d(_) | Op::ResizeBilinear { .. } => node.inputs.iter().skip(1).copied().collect(),
         Op::MaxPool(_) => vec![node.inputs[0], node.output],
         _ => Vec::new(),

@@ -74,7 +74,7 @@ impl Builder<'_> {
         let (weights, rescale, bounds, _) = self.weighted(node, &layer, input, residual)?;
         let output = self.tensor(node.output);
         let padding_codes = match &conv.normalization {
-            Some(n) => n.mean.iter().map(|&mean| (round(f64::from(mean)) - 128.0).clamp(-128.0, 127.0) as i8).collect(),
+            Some(n) => n.mean.iter().map(|&mean| self.code(input, mean).clamp(-128.0, 127.0) as i8).collect(),
             None => vec![self.zero_point(input) as i8; layer.inputs * layer.groups],
         };
         let (window, groups) = (conv.window, conv.groups);

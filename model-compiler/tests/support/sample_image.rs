@@ -45,8 +45,9 @@ pub mod ids {
     pub const COMMAND: u16 = 28;
     pub const BRANCH: u16 = 29;
     pub const CONTROLS: u16 = 30;
+    pub const POINTS: u16 = 31;
     /// First scratch record.
-    pub const SCRATCH: u16 = 31;
+    pub const SCRATCH: u16 = 32;
 }
 
 /// Positions of the sample's steps.
@@ -74,9 +75,10 @@ pub mod at {
     pub const GATHER_SUM: usize = 22;
     pub const BRANCH_LINEAR: usize = 23;
     pub const SIGMOID: usize = 24;
+    pub const SPATIAL_SOFTMAX: usize = 25;
 }
 
-pub const STEPS: usize = 25;
+pub const STEPS: usize = 26;
 
 /// Deterministic constants.
 struct Numbers {
@@ -162,10 +164,11 @@ pub fn parts() -> ImageParts {
             port("command", ids::COMMAND),
         ],
         outputs: vec![
-            port("waypoints", ids::WAYPOINTS),
+            ImagePort { scale: 1.0 / 65536.0, ..port("waypoints", ids::WAYPOINTS) },
             port("probabilities", ids::PROBABILITIES),
             port("gathered", ids::GATHERED),
             port("controls", ids::CONTROLS),
+            ImagePort { scale: 1.0 / 64.0, ..port("points", ids::POINTS) },
         ],
         arena_bytes,
         arena_alignment: 16,
@@ -209,6 +212,7 @@ fn shapes() -> Vec<(Shape, ElementType)> {
         (Shape::vector(1), I8),
         (Shape::vector(3), I16),
         (Shape::vector(3), I16),
+        (Shape::tokens(8, 2), I32),
     ]
 }
 
@@ -280,6 +284,7 @@ fn steps(n: &mut Numbers) -> Vec<Step> {
         gather_sum(),
         branch_linear(n),
         sigmoid(n),
+        spatial_softmax(n),
     ]
 }
 
@@ -471,6 +476,15 @@ fn sigmoid(n: &mut Numbers) -> Step {
         input_zero_point: 0,
         requant: requant(),
         tanh_table: n.builder.push(&tanh_table()).expect("fits"),
+    })
+}
+
+fn spatial_softmax(n: &mut Numbers) -> Step {
+    Step::SpatialSoftmax(SpatialSoftmax {
+        input: TensorId(ids::PROBABILITIES),
+        output: TensorId(ids::POINTS),
+        exponent: Requant { shift: 18, ..requant() },
+        exp_table: n.builder.push(&exp_table()).expect("fits"),
     })
 }
 

@@ -87,7 +87,7 @@ impl Network {
 
     /// Names and shapes of the checkpoint.
     pub fn shapes(&self) -> Vec<(String, Vec<usize>)> {
-        let mut list = List(Vec::new());
+        let mut list = List::default();
         if self.system == System::Cilrs {
             self.resnet(&mut list, "encoder.features", 3, &self.image_blocks);
             self.controller(&mut list);
@@ -124,20 +124,7 @@ impl Network {
 
     /// Generated values with plausible batch-norm statistics: activations stay of order 1 on real frames.
     pub fn tensors(&self) -> NamedTensors {
-        let shapes = self.shapes();
-        let mut tensors = generate(&shapes);
-        for (name, shape) in &shapes {
-            let Some((norm, leaf)) = name.rsplit_once('.') else { continue };
-            let variance = typical_variance(norm);
-            let (base, amplitude) = match leaf {
-                "running_var" => (variance, 0.25 * variance),
-                "running_mean" => (0.0, 0.3 * variance.sqrt()),
-                _ => continue,
-            };
-            let data = TensorData::Float(uniform(name, shape[0]).map(|u| base + amplitude * u).collect());
-            tensors.insert(name, NamedTensor { shape: shape.clone(), data });
-        }
-        tensors
+        plausible(&self.shapes(), typical_variance)
     }
 
     /// All values zero: enough where only names and shapes matter.
@@ -240,6 +227,23 @@ impl Network {
     }
 }
 
+/// Generated values with batch-norm statistics around a variance that follows from the norm's name.
+pub(super) fn plausible(shapes: &[(String, Vec<usize>)], typical_variance: impl Fn(&str) -> f32) -> NamedTensors {
+    let mut tensors = generate(shapes);
+    for (name, shape) in shapes {
+        let Some((norm, leaf)) = name.rsplit_once('.') else { continue };
+        let variance = typical_variance(norm);
+        let (base, amplitude) = match leaf {
+            "running_var" => (variance, 0.25 * variance),
+            "running_mean" => (0.0, 0.3 * variance.sqrt()),
+            _ => continue,
+        };
+        let data = TensorData::Float(uniform(name, shape[0]).map(|u| base + amplitude * u).collect());
+        tensors.insert(name, NamedTensor { shape: shape.clone(), data });
+    }
+    tensors
+}
+
 /// Means over the statistics that the published networks show with generated weights: the images' raw range makes the
 /// first one large, the sparse LiDAR histogram small; elsewhere inputs are of order 1.
 fn typical_variance(norm: &str) -> f32 {
@@ -254,10 +258,12 @@ fn typical_variance(norm: &str) -> f32 {
     }
 }
 
-struct List(Vec<(String, Vec<usize>)>);
+/// Names and shapes under construction.
+#[derive(Default)]
+pub(super) struct List(pub Vec<(String, Vec<usize>)>);
 
 impl List {
-    fn add(&mut self, name: String, shape: &[usize]) {
+    pub fn add(&mut self, name: String, shape: &[usize]) {
         self.0.push((name, shape.to_vec()));
     }
 
@@ -271,7 +277,13 @@ impl List {
         self.add(format!("{module}.bias"), &[channels]);
     }
 
-    fn batch_norm(&mut self, module: &str, channels: usize) {
+    /// Convolution without bias and batch norm: members `first` and `first + 1` of a module.
+    pub fn conv_norm(&mut self, module: &str, first: usize, shape: [usize; 4]) {
+        self.add(format!("{module}.{first}.weight"), &shape);
+        self.batch_norm(&format!("{module}.{}", first + 1), shape[0]);
+    }
+
+    pub fn batch_norm(&mut self, module: &str, channels: usize) {
         self.norm(module, channels);
         self.add(format!("{module}.running_mean"), &[channels]);
         self.add(format!("{module}.running_var"), &[channels]);

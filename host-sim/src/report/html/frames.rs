@@ -16,9 +16,10 @@ pub(super) fn section(frames: &[FrameReport]) -> Markup {
     let mut sorted: Vec<&FrameReport> = frames.iter().collect();
     sorted.sort_by(|a, b| b.badness().total_cmp(&a.badness()));
     let row = |frame: &&FrameReport| {
-        let distances = frame.waypoint_error_mm.iter().map(|&mm| figure(Some(mm), 0));
+        let waypoints = frame.waypoint_error_mm.iter().map(|&mm| figure(Some(mm), 0));
         let controls = frame.control_errors().into_iter().map(|(_, error)| figure(Some(error), DIGITS));
-        let errors: Vec<String> = distances.chain(controls).collect();
+        let points = frame.point_error_px.iter().map(|&pixels| figure(Some(pixels), 2));
+        let errors: Vec<String> = waypoints.chain(controls).chain(points).collect();
         vec![
             frame.name.clone(),
             if frame.calibration { "yes" } else { "no" }.to_owned(),
@@ -30,8 +31,14 @@ pub(super) fn section(frames: &[FrameReport]) -> Markup {
         ]
     };
     let rows: Vec<_> = sorted.iter().take(SHOWN).map(row).collect();
-    let gives_controls = frames.iter().any(|frame| frame.control.is_some());
-    let error = if gives_controls { "error of steer, throttle, brake, speed" } else { "waypoint error, mm" };
+    let any = |has: fn(&FrameReport) -> bool| frames.iter().any(has);
+    let error = if any(|frame| frame.control.is_some()) {
+        "error of steer, throttle, brake, speed"
+    } else if any(|frame| frame.points.is_some()) {
+        "point error, px"
+    } else {
+        "waypoint error, mm"
+    };
     let header = ["frame", "calibration", "worst step", "its dB", "pooled vector, dB", "first output, dB", error];
     let about = html! {
         "Figures of every frame by itself, the worst first."

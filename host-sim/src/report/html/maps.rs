@@ -41,7 +41,8 @@ pub(super) fn small_camera_uri(map: &ByteMap, height: u32) -> String {
     png_uri(small.as_raw(), width as usize, height as usize, ExtendedColorType::Rgb8)
 }
 
-fn png_uri(pixels: &[u8], width: usize, height: usize, color: ExtendedColorType) -> String {
+/// A PNG file inside its address.
+pub(super) fn png_uri(pixels: &[u8], width: usize, height: usize, color: ExtendedColorType) -> String {
     let mut bytes = Vec::new();
     let encoder = PngEncoder::new(&mut bytes);
     encoder.write_image(pixels, width as u32, height as u32, color).expect("a map has its shape's number of bytes");

@@ -103,6 +103,11 @@ fn figures(report: &VerifyReport) -> Vec<(&'static str, String, String)> {
         let names: Vec<String> = summary.control_error.iter().map(|e| titled(&e.name)).collect();
         figures.push(("Control error", means.join(", "), format!("mean of {}", names.join("; "))));
     }
+    if let Some(last) = summary.point_error_px.last() {
+        let means: Vec<String> = summary.point_error_px.iter().map(|e| figure(Some(e.mean), 2)).collect();
+        let note = format!("mean of points 1 to {}; the last is {:.2} px off at most", means.len(), last.max);
+        figures.push(("Point error", format!("{} px", means.join(", ")), note));
+    }
     let arena = format!("bound {}: {}", bytes(summary.arena_bound_bytes), summary.arena_status.words());
     figures.push(("Arena", bytes(summary.arena_bytes), arena));
     figures.push(("Flash", bytes(summary.flash_bytes), String::new()));

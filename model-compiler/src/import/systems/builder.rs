@@ -2,6 +2,7 @@
 
 use super::weights::{Problems, oihw_to_ohwi};
 use crate::error::{Error, ErrorCode, Result};
+use crate::frames::views::LEVELS;
 use crate::import::{ImportOptions, NamedTensors, System};
 use crate::ir::{
     BatchNorm, Clip, Conv2d, Graph, InputKind, LayerNorm, Linear, Normalization, Op, Shape, ValueId, Weights,
@@ -113,6 +114,28 @@ impl<'a> Builder<'a> {
             normalization: None,
             clip: Clip::NONE,
         }
+    }
+
+    /// Batch norm that was trained on values 0..=1, over grey levels 0..=255: all its statistics are times 255.
+    pub(super) fn grey_norm(&mut self, module: &str, input: ValueId) -> Result<ValueId> {
+        let channels = [usize::from(self.graph.value(input).shape.channels)];
+        let mut vector = |leaf: &str| self.vector(&format!("{module}.{leaf}"), &channels);
+        let scaled = |values: Arc<Vec<f32>>, factor: f32| Arc::new(values.iter().map(|v| v * factor).collect());
+        let op = BatchNorm {
+            weight: vector("weight"),
+            bias: vector("bias"),
+            mean: scaled(vector("running_mean"), LEVELS),
+            variance: scaled(vector("running_var"), LEVELS * LEVELS),
+            epsilon: EPSILON * LEVELS * LEVELS,
+        };
+        self.push(module, Op::BatchNorm(op), &[input])
+    }
+
+    /// 1×1 convolution with bias.
+    pub(super) fn conv_1x1(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
+        let inputs = usize::from(self.graph.value(input).shape.channels);
+        let op = self.pointwise(module, inputs, outputs);
+        self.push(module, Op::Conv2d(op), &[input])
     }
 
     /// Linear layer with bias.

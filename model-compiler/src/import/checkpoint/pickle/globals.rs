@@ -20,7 +20,7 @@ pub enum Global {
 }
 
 /// Names that training frameworks put beside the weights.
-const INERT: [(&str, &str); 24] = [
+const INERT: [(&str, &str); 26] = [
     ("__builtin__", "dict"),
     ("__builtin__", "frozenset"),
     ("__builtin__", "list"),
@@ -36,6 +36,8 @@ const INERT: [(&str, &str); 24] = [
     ("numpy", "dtype"),
     ("numpy._core.multiarray", "scalar"),
     ("numpy.core.multiarray", "scalar"),
+    ("pathlib", "PosixPath"),
+    ("pathlib", "WindowsPath"),
     ("pytorch_lightning.callbacks.early_stopping", "EarlyStopping"),
     ("pytorch_lightning.callbacks.model_checkpoint", "ModelCheckpoint"),
     ("pytorch_lightning.utilities.parsing", "AttributeDict"),
