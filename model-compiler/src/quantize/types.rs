@@ -8,6 +8,7 @@
 //! | residual stream of a transformer | i16, one scale for all its taps |
 //! | skip values of the ResNets | i8 affine, or i16 per stage |
 //! | global pools and the vectors behind them, logits of a softmax | i16 |
+//! | maps that cells are gathered from, their sums and the layers behind these | i16 |
 //! | probabilities | i16, scale 2^-15 |
 //! | GRU start state | i16, a power of two |
 //! | velocity, goal, waypoints | fixed point |
@@ -106,7 +107,7 @@ pub(super) enum Role {
     Stream(usize),
     /// A value that skips over a residual block.
     Skip,
-    /// A pooled vector or a vector behind it.
+    /// A pooled vector or sum of cells, or a vector behind it.
     Vector,
     /// Start state of the decoder.
     Hidden,
@@ -124,6 +125,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
     let stages = stages(graph);
     let borders = copies::borders(graph, statistics);
     let stream_maxima = stream_maxima(graph, statistics, options, &roles);
+    let sum_maxima = sum_maxima(graph, statistics);
     let mut types: Vec<Stored> = Vec::with_capacity(graph.values.len());
     for (index, role) in roles.iter().enumerate() {
         let id = ValueId(index as u32);
@@ -141,7 +143,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
             Role::Stream(_) => narrow(),
             Role::Skip if options.skip.is_wide(stages[index]) => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
             Role::Skip => narrow(),
-            Role::Vector => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
+            Role::Vector => Stored::i16(symmetric_i16(*sum_maxima.get(&id).unwrap_or(&seen.max_abs()), 1.25)),
             Role::Hidden => hidden_state(seen.max_abs()),
             Role::Probabilities => Stored::fixed(ElementType::I16, f64::exp2(-15.0), 0),
         });
@@ -191,7 +193,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
             Op::Conv2d(conv) if of(0) == Some(Role::Vector) && super::is_linear(conv, shape(0)) => Role::Vector,
             Op::Conv2d(_) if node.inputs.len() == 2 => Role::Skip,
             Op::ResizeBilinear { .. } if node.inputs.len() == 2 => Role::Skip,
-            Op::GlobalPool => Role::Vector,
+            Op::GlobalPool | Op::GatherSum => Role::Vector,
             Op::AveragePool(_) if graph.value(node.output).shape.positions() == 1 => Role::Vector,
             Op::Concat(_) if (0..node.inputs.len()).any(wide) => Role::Vector,
             Op::Slice(_) | Op::Pad(_) | Op::Clip(_) if of(0) == Some(Role::Vector) => Role::Vector,
@@ -209,7 +211,8 @@ fn roles(graph: &Graph) -> Vec<Role> {
                 (Op::WaypointDecoder(_), _) => *role = Role::Hidden,
                 (Op::Attention { .. }, _) => {}
                 (Op::Softmax, Role::Narrow | Role::Skip) => *role = Role::Vector,
-                (Op::Softmax, _) => {}
+                (Op::GatherSum, Role::Narrow) => *role = Role::Vector,
+                (Op::Softmax | Op::GatherSum, _) => {}
                 (_, Role::Narrow) => *role = Role::Skip,
                 _ => {}
             }
@@ -229,7 +232,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
 fn promoted(node: &Node) -> Vec<ValueId> {
     match &node.op {
         Op::Attention { .. } => node.inputs.clone(),
-        Op::WaypointDecoder(_) | Op::Softmax => vec![node.inputs[0]],
+        Op::WaypointDecoder(_) | Op::Softmax | Op::GatherSum => vec![node.inputs[0]],
         Op::Conv2d(_) | Op::ResizeBilinear { .. } => node.inputs.iter().skip(1).copied().collect(),
         Op::MaxPool(_) => vec![node.inputs[0], node.output],
         _ => Vec::new(),
@@ -245,6 +248,16 @@ fn stages(graph: &Graph) -> Vec<u8> {
         stages[node.output.0 as usize] = named.unwrap_or(inherited);
     }
     stages
+}
+
+/// Largest magnitude that sums of cells can have, whichever cells these are: the calibration frames do not tell it.
+fn sum_maxima(graph: &Graph, statistics: &Statistics) -> HashMap<ValueId, f64> {
+    let sums = graph.nodes.iter().filter(|node| matches!(node.op, Op::GatherSum));
+    let maximum = |node: &Node| {
+        let cells = graph.value(node.inputs[1]).shape.channels / 2;
+        f64::from(cells) * statistics.of(node.inputs[0]).max_abs()
+    };
+    sums.map(|node| (node.output, maximum(node))).collect()
 }
 
 /// Largest magnitude of each stream over all its taps, with room for the fastest velocity.
