@@ -125,7 +125,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
     let stages = stages(graph);
     let borders = copies::borders(graph, statistics);
     let stream_maxima = stream_maxima(graph, statistics, options, &roles);
-    let sum_maxima = sum_maxima(graph, statistics);
+    let headroom = headroom(graph, statistics);
     let mut types: Vec<Stored> = Vec::with_capacity(graph.values.len());
     for (index, role) in roles.iter().enumerate() {
         let id = ValueId(index as u32);
@@ -143,7 +143,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
             Role::Stream(_) => narrow(),
             Role::Skip if options.skip.is_wide(stages[index]) => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
             Role::Skip => narrow(),
-            Role::Vector => Stored::i16(symmetric_i16(*sum_maxima.get(&id).unwrap_or(&seen.max_abs()), 1.25)),
+            Role::Vector => Stored::i16(symmetric_i16(headroom[index] * seen.max_abs(), 1.25)),
             Role::Hidden => hidden_state(seen.max_abs()),
             Role::Probabilities => Stored::fixed(ElementType::I16, f64::exp2(-15.0), 0),
         });
@@ -250,14 +250,22 @@ fn stages(graph: &Graph) -> Vec<u8> {
     stages
 }
 
-/// Largest magnitude that sums of cells can have, whichever cells these are: the calibration frames do not tell it.
-fn sum_maxima(graph: &Graph, statistics: &Statistics) -> HashMap<ValueId, f64> {
-    let sums = graph.nodes.iter().filter(|node| matches!(node.op, Op::GatherSum));
-    let maximum = |node: &Node| {
-        let cells = graph.value(node.inputs[1]).shape.channels / 2;
-        f64::from(cells) * statistics.of(node.inputs[0]).max_abs()
-    };
-    sums.map(|node| (node.output, maximum(node))).collect()
+/// How many times larger than seen a value may become: where sums of cells come from the calibration frames' cells, others
+/// may sum up to more, and the layers behind them follow. 16 bits have room for it.
+fn headroom(graph: &Graph, statistics: &Statistics) -> Vec<f64> {
+    let mut headroom = vec![1.0; graph.values.len()];
+    for node in &graph.nodes {
+        let max = |id: ValueId| statistics.of(id).max_abs();
+        headroom[node.output.0 as usize] = match &node.op {
+            Op::GatherSum if max(node.output) > 0.0 => {
+                let cells = graph.value(node.inputs[1]).shape.channels / 2;
+                f64::from(cells) * max(node.inputs[0]) / max(node.output)
+            }
+            Op::Linear(_) | Op::Clip(_) => headroom[node.inputs[0].0 as usize],
+            _ => 1.0,
+        };
+    }
+    headroom
 }
 
 /// Largest magnitude of each stream over all its taps, with room for the fastest velocity.
