@@ -261,7 +261,9 @@ fn headroom(graph: &Graph, statistics: &Statistics) -> Vec<f64> {
                 let cells = graph.value(node.inputs[1]).shape.channels / 2;
                 f64::from(cells) * max(node.inputs[0]) / max(node.output)
             }
-            Op::Linear(_) | Op::Clip(_) => headroom[node.inputs[0].0 as usize],
+            Op::Linear(_) | Op::Clip(_) | Op::GlobalPool => {
+                node.inputs.iter().map(|id| headroom[id.0 as usize]).fold(1.0, f64::max)
+            }
             _ => 1.0,
         };
     }
