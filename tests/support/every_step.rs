@@ -75,7 +75,9 @@ pub fn graph() -> Graph {
     let lidar_tokens = b.push("lidar.enlarged", enlarged, &[lidar_normed]);
     let lidar = b.push("lidar.fused", Op::Add { clip: Clip::RELU }, &[lidar, lidar_tokens]);
     let image_sums = b.push("image.gathered", Op::GatherSum, &[lidar, camera_points]);
-    let lidar_sums = b.push("lidar.gathered", Op::GatherSum, &[image, bev_points]);
+    let counts = b.push("lidar.gathered", Op::GatherSum, &[bev, bev_points]);
+    let channels = Pad { before: [0, 0, 2], after: [0; 3], value: 0.0 };
+    let lidar_sums = b.push("lidar.sums", Op::Pad(channels), &[counts]);
     let sums = b.push("gathered", Op::Add { clip: Clip::NONE }, &[image_sums, lidar_sums]);
     let image = b.push("image.projected", Op::ResizeBilinear { factor: (2, 2) }, &[sums, image]);
     let features = b.push("features", Op::GlobalPool, &[image, lidar]);
@@ -105,8 +107,8 @@ pub fn frames(seed: u64, count: usize) -> Vec<Frame> {
         velocity: Some(1.5 * i as f64),
         goal: Some([2.0 - i as f64, -8.0 - 3.0 * i as f64]),
         command: Some(1 + (i % BRANCHES) as u8),
-        bev_points: map(LISTS, 4),
-        camera_points: map(LISTS, 4),
+        bev_points: map(LISTS, 2),
+        camera_points: map(LISTS, 2),
         ..Frame::default()
     };
     (0..count).map(frame).collect()

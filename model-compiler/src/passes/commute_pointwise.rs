@@ -1,11 +1,11 @@
-//! A 1×1 convolution changes places with the average pool behind it or the bilinear enlargement in front of it, so that
-//! it runs on the smaller map.
+//! A 1×1 convolution or linear layer changes places with the average pool behind it or the bilinear enlargement in front
+//! of it, so that it runs on the smaller map.
 //!
-//! Both are means whose weights sum to one, the same for every channel: what a convolution of one position makes of a
-//! mean is the mean of what it makes, its bias included. Exact in real arithmetic.
+//! Both are means whose weights sum to one, the same for every channel: what a layer of one position makes of a mean is
+//! the mean of what it makes, its bias included. Exact in real arithmetic.
 
 use super::rewrite::{exchange, own_producer};
-use crate::ir::{Clip, Conv2d, Graph, Op, Shape};
+use crate::ir::{Clip, Graph, Op, Shape, Weights};
 use firmware::program::Window;
 
 /// Taps of an enlargement.
@@ -17,46 +17,57 @@ pub(super) fn run(graph: &mut Graph) {
         if [producer, reader].iter().any(|node| graph.nodes[*node].inputs.len() != 1) {
             continue;
         }
-        let shape = |node: usize, operand: usize| graph.value(graph.nodes[node].inputs[operand]).shape;
-        let (input, between) = (shape(producer, 0), shape(reader, 0));
-        let output = graph.value(graph.nodes[reader].output).shape;
-        let exchanged = match (&graph.nodes[producer].op, &graph.nodes[reader].op) {
-            (Op::Conv2d(conv), Op::AveragePool(window)) if is_pointwise(conv) => {
-                let taps = u64::from(window.kernel_h) * u64::from(window.kernel_w);
-                let now = products(conv, between) + taps * output.elements();
-                let then = Shape { channels: input.channels, ..output };
-                (products(conv, output) + taps * then.elements() < now).then_some(then)
-            }
-            (Op::ResizeBilinear { .. }, Op::Conv2d(conv)) if is_pointwise(conv) => {
-                let now = BILINEAR_TAPS * between.elements() + products(conv, output);
-                let then = Shape { channels: output.channels, ..input };
-                (products(conv, then) + BILINEAR_TAPS * output.elements() < now).then_some(then)
-            }
-            _ => None,
-        };
-        if let Some(between) = exchanged {
+        let (front, behind) = (&graph.nodes[producer], &graph.nodes[reader]);
+        let shapes = [front.inputs[0], front.output, behind.output].map(|id| graph.value(id).shape);
+        if let Some(between) = exchanged(&front.op, &behind.op, shapes) {
             exchange(graph, producer, reader, between);
         }
     }
 }
 
-/// Whether each position of the result depends, without bounds, on the same position alone.
-fn is_pointwise(conv: &Conv2d) -> bool {
-    let window = Window { dilation_h: 1, dilation_w: 1, ..conv.window };
-    window == Window::square(1, 1, 0) && conv.clip == Clip::NONE && conv.normalization.is_none()
+/// The shape between two operators after they changed places, if that is cheaper; `shapes` are those before, between and
+/// behind them now. What counts are products, and values that are averaged.
+fn exchanged(front: &Op, behind: &Op, [input, between, output]: [Shape; 3]) -> Option<Shape> {
+    let (now, then, shape) = match (pointwise(front), behind) {
+        (Some(weights), Op::AveragePool(window)) => {
+            let taps = u64::from(window.kernel_h) * u64::from(window.kernel_w);
+            let shape = Shape { channels: input.channels, ..output };
+            let now = products(weights, between) + taps * output.elements();
+            (now, taps * shape.elements() + products(weights, output), shape)
+        }
+        _ => {
+            let (Op::ResizeBilinear { .. }, Some(weights)) = (front, pointwise(behind)) else { return None };
+            let shape = Shape { channels: output.channels, ..input };
+            let now = BILINEAR_TAPS * between.elements() + products(weights, output);
+            (now, products(weights, shape) + BILINEAR_TAPS * output.elements(), shape)
+        }
+    };
+    (then < now).then_some(shape)
 }
 
-/// Multiply-accumulates of a convolution that gives a map of this size.
-fn products(conv: &Conv2d, output: Shape) -> u64 {
-    let [_, per_output @ ..] = &conv.weights.shape[..] else { return 0 };
-    u64::from(output.positions()) * conv.weights.shape[0] as u64 * per_output.iter().product::<usize>() as u64
+/// The weights of an operator whose result at each position depends, without bounds, on the same position alone.
+fn pointwise(op: &Op) -> Option<&Weights> {
+    match op {
+        Op::Conv2d(conv) => {
+            let window = Window { dilation_h: 1, dilation_w: 1, ..conv.window };
+            let alone = window == Window::square(1, 1, 0) && conv.normalization.is_none();
+            (alone && conv.clip == Clip::NONE).then_some(&*conv.weights)
+        }
+        Op::Linear(linear) => (linear.clip == Clip::NONE).then_some(&*linear.weights),
+        _ => None,
+    }
+}
+
+/// Multiply-accumulates over a map of this size.
+fn products(weights: &Weights, map: Shape) -> u64 {
+    u64::from(map.positions()) * weights.shape.iter().product::<usize>() as u64
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::ir::ValueId;
     use crate::ir::verify::verify;
+    use crate::ir::{Conv2d, Linear, ValueId};
     use crate::passes::fixture::{conv, image};
     use crate::reference;
     use std::sync::Arc;
@@ -110,6 +121,20 @@ mod tests {
         assert_equivalent(&mut graph);
         assert_eq!(operators(&graph), named([("up.input", "conv2d"), ("conv", "resize_bilinear")]));
         assert_eq!(graph.macs() * 4, macs);
+    }
+
+    #[test]
+    fn a_linear_layer_moves_like_a_convolution() {
+        let (mut graph, rgb) = image();
+        let enlarged = graph.push("up", ENLARGE, &[rgb]).unwrap();
+        let weights = Arc::new(Weights { shape: vec![2, 3], data: vec![1.0, -2.0, 3.0, 0.5, 4.0, -1.0] });
+        let linear = Linear { weights, bias: Some(Arc::new(vec![7.0, -9.0])), clip: Clip::NONE };
+        let x = graph.push("linear", Op::Linear(linear), &[enlarged]).unwrap();
+        let x = graph.push("pool", Op::AveragePool(Window::square(4, 4, 0)), &[x]).unwrap();
+        graph.outputs.push(x);
+        assert_equivalent(&mut graph);
+        let expected = [("up.input", "linear"), ("linear", "resize_bilinear"), ("pool", "average_pool")];
+        assert_eq!(operators(&graph), named(expected));
     }
 
     #[test]

@@ -201,6 +201,46 @@ fn a_plain_layer_behind_branches_is_corrected_by_the_mean_of_all() {
 }
 
 #[test]
+fn sums_of_cells_and_layers_behind_them_have_room_for_cells_that_were_not_seen() {
+    let (mut graph, rgb) = image(Shape::map(2, 2, 3));
+    let map = conv(&mut graph, "map", rgb, 0.0);
+    let lists = graph.push_input("bev_points", InputKind::BevPoints, Shape::map(1, 1, 8));
+    let sums = graph.push("sums", Op::GatherSum, &[map, lists]).unwrap();
+    let weights = Arc::new(Weights { shape: vec![2, 4], data: vec![0.5; 8] });
+    let linear = Linear { weights, bias: None, clip: Clip::NONE };
+    let behind = graph.push("behind", Op::Linear(linear), &[sums]).unwrap();
+    graph.outputs.push(behind);
+    let pixels = (0..12).map(|i| (i * 37 % 256) as f32).collect();
+    let frames = [vec![pixels, vec![0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0, 1.0]]];
+    let statistics = calibrate(&graph, &frames, |_, _| ()).unwrap();
+    let model = quantize(&graph, &frames, &statistics, &QuantizeOptions::default(), |_, _| ()).unwrap();
+    assert_eq!(names(&model), [("map", "conv2d"), ("sums", "gather_sum"), ("behind", "linear")]);
+    let seen = |value: ValueId| statistics.of(value).max_abs();
+    let reach = |step: usize| {
+        let tensor = model.tensor(model.steps[step].op.output());
+        assert_eq!(tensor.element, ElementType::I16);
+        tensor.scale * 32767.0
+    };
+    let four_times_the_largest = 4.0 * seen(map);
+    assert!(seen(sums) < 0.9 * four_times_the_largest, "the cells differ");
+    assert!(reach(1) > 1.2 * four_times_the_largest && reach(1) < 1.3 * four_times_the_largest);
+    assert!(reach(2) > 1.2 * seen(behind) * four_times_the_largest / seen(sums));
+}
+
+#[test]
+fn indices_are_an_input() {
+    let (mut graph, rgb) = image(Shape::map(2, 2, 3));
+    let map = conv(&mut graph, "map", rgb, 0.0);
+    let sums = graph.push("sums", Op::GatherSum, &[map, map]).unwrap();
+    let error = quantized(&mut graph, sums).unwrap_err();
+    assert_eq!(
+        error.to_string(),
+        "node sums: indices map: found computed values, expected an input of cells\n  \
+         help: gather by an input, not by a result"
+    );
+}
+
+#[test]
 fn fixed_point_is_no_operand_of_a_copy() {
     let mut graph = Graph::default();
     let goal = graph.push_input("goal", InputKind::Goal, Shape::vector(2));

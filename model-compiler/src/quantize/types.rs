@@ -8,6 +8,7 @@
 //! | residual stream of a transformer | i16, one scale for all its taps |
 //! | skip values of the ResNets | i8 affine, or i16 per stage |
 //! | global pools and the vectors behind them, vectors behind the velocity | i16 |
+//! | maps that cells are gathered from, their sums and the layers behind these | i16 |
 //! | what a softmax or sigmoid reads (before an enlargement, too) | i16 |
 //! | probabilities, results of a sigmoid | i16, scale 2^-15 |
 //! | GRU start state | i16, a power of two |
@@ -107,7 +108,7 @@ pub(super) enum Role {
     Stream(usize),
     /// A value that skips over a residual block.
     Skip,
-    /// A pooled vector or a vector behind it, or behind the velocity.
+    /// A pooled vector or sum of cells, or a vector behind it, or behind the velocity.
     Vector,
     /// Start state of the decoder.
     Hidden,
@@ -127,6 +128,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
     let stages = stages(graph);
     let borders = copies::borders(graph, statistics);
     let stream_maxima = stream_maxima(graph, statistics, options, &roles);
+    let headroom = headroom(graph, statistics);
     let mut types: Vec<Stored> = Vec::with_capacity(graph.values.len());
     for (index, role) in roles.iter().enumerate() {
         let id = ValueId(index as u32);
@@ -145,7 +147,7 @@ pub fn assign(graph: &Graph, statistics: &Statistics, options: &QuantizeOptions)
             Role::Stream(_) => narrow(),
             Role::Skip if options.skip.is_wide(stages[index]) => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
             Role::Skip => narrow(),
-            Role::Vector => Stored::i16(symmetric_i16(seen.max_abs(), 1.25)),
+            Role::Vector => Stored::i16(symmetric_i16(headroom[index] * seen.max_abs(), 1.25)),
             Role::Hidden => hidden_state(seen.max_abs()),
             Role::Probabilities => Stored::fixed(ElementType::I16, f64::exp2(-15.0), 0),
             Role::Points => Stored::fixed(ElementType::I32, f64::exp2(-6.0), 0),
@@ -197,7 +199,7 @@ fn roles(graph: &Graph) -> Vec<Role> {
             Op::Conv2d(conv) if of(0) == Some(Role::Vector) && super::is_linear(conv, shape(0)) => Role::Vector,
             Op::Conv2d(_) if node.inputs.len() == 2 => Role::Skip,
             Op::ResizeBilinear { .. } if node.inputs.len() == 2 => Role::Skip,
-            Op::GlobalPool => Role::Vector,
+            Op::GlobalPool | Op::GatherSum => Role::Vector,
             Op::AveragePool(_) if graph.value(node.output).shape.positions() == 1 => Role::Vector,
             // A mean of grey levels is one, and what stands for padding behind it must have a code, too.
             Op::AveragePool(_) => match of(0) {
@@ -223,7 +225,8 @@ fn roles(graph: &Graph) -> Vec<Role> {
                 (Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. }, Role::Narrow | Role::Skip) => {
                     *role = Role::Vector;
                 }
-                (Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. }, _) => {}
+                (Op::GatherSum, Role::Narrow) => *role = Role::Vector,
+                (Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. } | Op::GatherSum, _) => {}
                 (_, Role::Narrow) => *role = Role::Skip,
                 _ => {}
             }
@@ -250,7 +253,9 @@ fn roles(graph: &Graph) -> Vec<Role> {
 fn promoted(node: &Node) -> Vec<ValueId> {
     match &node.op {
         Op::Attention { .. } => node.inputs.clone(),
-        Op::WaypointDecoder(_) | Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. } => vec![node.inputs[0]],
+        Op::WaypointDecoder(_) | Op::Softmax | Op::Sigmoid | Op::SpatialSoftmax { .. } | Op::GatherSum => {
+            vec![node.inputs[0]]
+        }
         Op::Conv2d(_) | Op::ResizeBilinear { .. } => node.inputs.iter().skip(1).copied().collect(),
         Op::MaxPool(_) => vec![node.inputs[0], node.output],
         _ => Vec::new(),
@@ -266,6 +271,26 @@ fn stages(graph: &Graph) -> Vec<u8> {
         stages[node.output.0 as usize] = named.unwrap_or(inherited);
     }
     stages
+}
+
+/// How many times larger than seen a value may become: where sums of cells come from the calibration frames' cells, others
+/// may sum up to more, and the layers behind them follow. 16 bits have room for it.
+fn headroom(graph: &Graph, statistics: &Statistics) -> Vec<f64> {
+    let mut headroom = vec![1.0; graph.values.len()];
+    for node in &graph.nodes {
+        let max = |id: ValueId| statistics.of(id).max_abs();
+        headroom[node.output.0 as usize] = match &node.op {
+            Op::GatherSum if max(node.output) > 0.0 => {
+                let cells = graph.value(node.inputs[1]).shape.channels / 2;
+                f64::from(cells) * max(node.inputs[0]) / max(node.output)
+            }
+            Op::Linear(_) | Op::Clip(_) | Op::GlobalPool => {
+                node.inputs.iter().map(|id| headroom[id.0 as usize]).fold(1.0, f64::max)
+            }
+            _ => 1.0,
+        };
+    }
+    headroom
 }
 
 /// Largest magnitude of each stream over all its taps, with room for the fastest velocity.

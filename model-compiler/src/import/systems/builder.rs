@@ -102,18 +102,12 @@ impl<'a> Builder<'a> {
         self.push(norm, Op::BatchNorm(op), &[map])
     }
 
-    /// Weights and bias of a 1×1 convolution.
-    pub(super) fn pointwise(&mut self, module: &str, inputs: usize, outputs: usize) -> Conv2d {
-        let shape = [outputs, inputs, 1, 1];
-        let values = self.problems.take(&mut self.tensors, &format!("{module}.weight"), &shape);
-        Conv2d {
-            weights: oihw_to_ohwi(&values, shape),
-            bias: Some(self.vector(&format!("{module}.bias"), &shape[..1])),
-            window: Window::square(1, 1, 0),
-            groups: 1,
-            normalization: None,
-            clip: Clip::NONE,
-        }
+    /// Weights and bias of a 1×1 convolution: a linear layer for each position.
+    pub(super) fn pointwise(&mut self, module: &str, inputs: usize, outputs: usize) -> Linear {
+        let weights = self.weights(&format!("{module}.weight"), &[outputs, inputs, 1, 1]);
+        let weights = Weights { shape: vec![outputs, inputs], data: Arc::unwrap_or_clone(weights).data };
+        let bias = Some(self.vector(&format!("{module}.bias"), &[outputs]));
+        Linear { weights: Arc::new(weights), bias, clip: Clip::NONE }
     }
 
     /// Batch norm that was trained on values 0..=1, over grey levels 0..=255: all its statistics are times 255.

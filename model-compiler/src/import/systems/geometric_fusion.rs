@@ -12,7 +12,7 @@ use super::resnet::{self, ResNet};
 use super::{DEFAULT_RESOLUTION, has, head};
 use crate::error::{Error, ErrorCode, Result};
 use crate::import::NamedTensors;
-use crate::ir::{Clip, Conv2d, InputKind, Linear, Op, Shape, ValueId};
+use crate::ir::{Clip, InputKind, Linear, Op, Shape, ValueId};
 use firmware::program::Window;
 
 const IMAGE: &str = "encoder.image_encoder.features";
@@ -116,11 +116,11 @@ struct Side {
     name: &'static str,
     scale: usize,
     /// From the map to its embedding.
-    conv: Conv2d,
+    conv: Linear,
     /// From gathered embeddings of this map to what the other map gets; a ReLU behind each layer.
     projection: Vec<Linear>,
     /// From what this map gets to its channels.
-    deconv: Conv2d,
+    deconv: Linear,
 }
 
 impl Side {
@@ -149,7 +149,7 @@ impl Side {
     /// The map's features per cell.
     fn embed(&self, b: &mut Builder<'_>, map: ValueId, grid: u16) -> Result<ValueId> {
         let Self { name, scale, .. } = self;
-        let features = b.push(format!("encoder.{name}_conv{scale}"), Op::Conv2d(self.conv.clone()), &[map])?;
+        let features = b.push(format!("encoder.{name}_conv{scale}"), Op::Linear(self.conv.clone()), &[map])?;
         let pixels = (b.graph.value(map).shape.height / grid) as u8;
         if pixels == 1 {
             return Ok(features);
@@ -179,7 +179,7 @@ impl Side {
             let factor = (pixels, pixels);
             x = b.push(format!("encoder.{name}_upsample{scale}"), Op::ResizeBilinear { factor }, &[x])?;
         }
-        x = b.push(format!("encoder.{name}_deconv{scale}"), Op::Conv2d(self.deconv.clone()), &[x])?;
+        x = b.push(format!("encoder.{name}_deconv{scale}"), Op::Linear(self.deconv.clone()), &[x])?;
         b.push(format!("encoder.{name}_add{scale}"), Op::Add { clip: Clip::NONE }, &[x, map])
     }
 }
