@@ -3,6 +3,7 @@
 
 use firmware::sensors::NotFinite;
 use firmware::sensors::camera::{Camera, CameraLayout, PixelFormat, Scale, Status};
+use firmware::sensors::correspondences::{CELLS, Correspondences, ELEMENTS, ENTRIES, Intrinsics};
 use firmware::sensors::heatmap;
 use firmware::sensors::inputs;
 use firmware::sensors::lidar::{Axes, Histogram, Mounting, Point, Statistics, Sweep};
@@ -44,21 +45,73 @@ fn widened<T: Copy + Into<i64>>(codes: &[T]) -> Vec<i64> {
     codes.iter().map(|&code| code.into()).collect()
 }
 
-#[test]
-fn golden_points_give_the_golden_histogram() {
+/// Points and counts of the stored sweep.
+fn golden_sweep() -> (Vec<Raw>, Vec<u8>) {
     let bytes = std::fs::read(golden::path("bev.safetensors")).unwrap();
     let file = SafeTensors::deserialize(&bytes).unwrap();
-    let points = file.tensor("points").unwrap();
-    let word = |bytes: &[u8], i: usize| u32::from_le_bytes([0, 1, 2, 3].map(|k| bytes[4 * i + k]));
-    let points = points.data().chunks_exact(12).map(|point| [0, 1, 2].map(|i| word(point, i)));
-    let count = points.len();
-    let (counts, statistics) = sweep(Histogram::TRANSFUSER, points.map(|bits| Mounting::TRAINED.place(bits)));
-    let expected = file.tensor("bev_counts").unwrap();
-    assert_eq!((statistics.points as usize, statistics.not_finite), (count, 0));
+    let coordinates = file.tensor("points").unwrap().data().as_chunks::<4>().0.iter().map(|&b| f32::from_le_bytes(b));
+    let points = coordinates.collect::<Vec<_>>().as_chunks::<3>().0.to_vec();
+    (points, file.tensor("bev_counts").unwrap().data().to_vec())
+}
+
+fn place(point: &Raw) -> Result<Point, NotFinite> {
+    Mounting::TRAINED.place(point.map(f32::to_bits))
+}
+
+#[test]
+fn golden_points_give_the_golden_histogram() {
+    let (points, expected) = golden_sweep();
+    let (counts, statistics) = sweep(Histogram::TRANSFUSER, points.iter().map(place));
+    assert_eq!((statistics.points as usize, statistics.not_finite), (points.len(), 0));
     assert_eq!(counts.iter().map(|&count| i32::from(count)).sum::<i32>(), 9422);
-    assert_eq!(counts.len(), expected.data().len());
-    for (i, (&found, &expected)) in counts.iter().zip(expected.data()).enumerate() {
+    assert_eq!(counts.len(), expected.len());
+    for (i, (&found, &expected)) in counts.iter().zip(&expected).enumerate() {
         assert_eq!(i32::from(found), i32::from(expected), "row {}, column {}, channel {}", i / 512, i / 2 % 256, i % 2);
+    }
+}
+
+/// Cell of the ground and cell of the image that see a point, by the published formulas in f64; `None` outside, and an
+/// error where u or v is so near to the border of a cell that the runtime may decide otherwise.
+fn cells([left, forward, _]: Raw) -> Result<Option<[[i8; 2]; 2]>, f64> {
+    let (x, y) = (f64::from(left), f64::from(forward));
+    if !(x.abs() < 16.0 && 0.0 < y && y < 32.0) {
+        return Ok(None);
+    }
+    let focal = 200.0 / 50.0_f64.to_radians().tan();
+    let image = [1.1 * focal * x / y + 200.0 - 72.0, focal * 2.3 / y + 150.0 - 22.0].map(|pixel| pixel / 32.0);
+    if let Some(&near) = image.iter().find(|cell| (*cell - cell.round()).abs() * 32.0 < 1.0 / 500.0) {
+        return Err(near);
+    }
+    let is_inside = image.iter().all(|cell| (0.0..8.0).contains(cell));
+    let ground = [((x + 16.0) * 8.0).min(255.0) / 32.0, (y * 8.0).min(255.0) / 32.0];
+    Ok(is_inside.then(|| [ground, image].map(|cell| cell.map(|i| i as i8))))
+}
+
+#[test]
+fn golden_points_join_the_cells_of_f64() {
+    let (mut points, _) = golden_sweep();
+    let count = points.len();
+    points.retain(|&point| cells(point).is_ok());
+    assert!(points.len() + 50 > count, "{} of {count} points lie beside borders of cells", count - points.len());
+    let mut expected = [[[[[0_i8; 2]; ENTRIES]; CELLS]; CELLS]; 2];
+    let mut lengths = [[[0; CELLS]; CELLS]; 2];
+    for [ground, image] in points.iter().filter_map(|&point| cells(point).ok().flatten()) {
+        for (view, [i, j], entry) in [(0, ground, image), (1, image, ground)] {
+            let (i, j) = (i as usize, j as usize);
+            if lengths[view][i][j] < ENTRIES {
+                expected[view][i][j][lengths[view][i][j]] = entry;
+                lengths[view][i][j] += 1;
+            }
+        }
+    }
+    let (mut bev, mut camera) = ([99; ELEMENTS], [99; ELEMENTS]);
+    let mut lists = Correspondences::new(Intrinsics::PUBLISHED, &mut bev, &mut camera).unwrap();
+    points.iter().for_each(|point| lists.push(place(point)));
+    let statistics = lists.finish();
+    assert_eq!((statistics.points as usize, statistics.not_finite), (points.len(), 0));
+    assert!(lengths.as_flattened().as_flattened().iter().filter(|&&length| length == ENTRIES).count() > 20);
+    for (found, expected) in [bev, camera].iter().zip(&expected) {
+        assert_eq!(found.as_slice(), expected.as_flattened().as_flattened().as_flattened());
     }
 }
 
@@ -85,7 +138,7 @@ fn random_clouds_give_the_histogram_of_f64() {
         let mut random = Random::new(seed);
         let shape = Shape::map(*random.pick(&sides), *random.pick(&sides), 2);
         // Splits and heights whose codes are even: exact.
-        let split = f64::from(random.signed_unit() * 4.0).mul_add(128.0, 0.0).round() / 128.0;
+        let split = (f64::from(random.signed_unit()) * 512.0).round() / 128.0;
         let height = *random.pick(&[2.5, 1.75, 1.5, 3.0, 2.5 + 1.0 / 32768.0]);
         let (axes, host_axes) = *random.pick(&[(Axes::Carla, LidarAxes::Carla), (Axes::Velodyne, LidarAxes::Velodyne)]);
         let points: Vec<Raw> = (0..5000).map(|_| [(); 3].map(|()| coordinate(&mut random))).collect();

@@ -47,7 +47,7 @@ fn camera(criterion: &mut Criterion) {
             let layout = CameraLayout { width: 800, height: 600, format, scale, map, first_channel, frozen_after: 10 };
             // 800 pixels of at most four bytes, and as many rows as a plane of chroma adds.
             let stride = 800 * 4;
-            let image: Vec<u8> = (0..900 * u64::from(stride)).map(|i| (i * 167 >> 3) as u8).collect();
+            let image: Vec<u8> = (0..900 * u64::from(stride)).map(|i| ((i * 167) >> 3) as u8).collect();
             let mut memory = vec![0; layout.memory_words()];
             let mut camera = Camera::new(layout, &mut memory).expect("a possible layout");
             let mut input = vec![0; map.elements() as usize];

@@ -34,12 +34,13 @@ use crate::tensor::Shape;
 use core::fmt;
 
 mod capture;
-mod pixels;
+mod format;
 #[cfg(test)]
 mod tests;
+mod write;
 
 pub use capture::Camera;
-pub use pixels::{PixelFormat, YuvRange};
+pub use format::{PixelFormat, YuvRange};
 
 /// How much smaller than the image its crop is taken. [`Self::Full`] takes the pixels as they are.
 ///
@@ -252,7 +253,8 @@ impl From<InputSize> for CameraError {
     }
 }
 
-/// Rows of the crop that lack a part; the network's input holds something older there.
+/// Rows of the crop that lack a part. The network's input holds something older there, or Y, U and V that are no colors
+/// yet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct MissingRows {

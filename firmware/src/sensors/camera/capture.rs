@@ -1,7 +1,8 @@
 //! One frame after the other: which rows came, what they add up to, whether anything moves.
 
-use super::pixels::{Span, Visitor, visit};
-use super::{CameraError, CameraLayout, LayoutError, MAX_BAND, MissingRows, PixelFormat, Status};
+use super::format::{Span, Visitor, visit};
+use super::write::{Add, Pixels, Store, Write};
+use super::{CameraError, CameraLayout, LayoutError, MAX_BAND, MissingRows, Status};
 use crate::sensors::InputSize;
 use crate::tensor::index;
 
@@ -199,12 +200,12 @@ impl<'a> Camera<'a> {
     }
 
     /// Pixels of the crop from this one on, in the network's input.
-    fn view<'b>(&self, row: u32, column: u32, input: &'b mut [i8]) -> View<'b> {
+    fn pixels<'b>(&self, row: u32, column: u32, input: &'b mut [i8]) -> Pixels<'b> {
         let channels = usize::from(self.layout.map.channels);
         let position = row.wrapping_mul(self.layout.map.width.into()).wrapping_add(column);
         let start = index(position).saturating_mul(channels);
         let codes = input.get_mut(start..).unwrap_or_default();
-        View { codes, channels, first_channel: self.layout.first_channel.into(), position }
+        Pixels { codes, channels, first_channel: self.layout.first_channel.into(), position }
     }
 
     /// Pixels that are taken as they are.
@@ -214,12 +215,12 @@ impl<'a> Camera<'a> {
         let end = self.left.wrapping_add(self.layout.map.width.into());
         let Some((span, count)) = piece.span(self.left.wrapping_add(done), end)? else { return Ok(()) };
         let (format, is_planar) = (self.layout.format, self.layout.is_planar());
-        let view = self.view(row, done, input);
+        let pixels = self.pixels(row, done, input);
         if is_planar {
-            visit(format, piece.is_chroma, piece.bytes, span, Store { view, is_chroma: piece.is_chroma });
+            visit(format, piece.is_chroma, piece.bytes, span, Store { pixels, is_chroma: piece.is_chroma });
             self.combine(row, piece.is_chroma, done..done.wrapping_add(count), input);
         } else {
-            visit(format, false, piece.bytes, span, Write { view, hash: &mut self.hash });
+            visit(format, false, piece.bytes, span, Write { pixels, hash: &mut self.hash });
         }
         self.advance(row, piece.is_chroma, done.wrapping_add(count));
         Ok(())
@@ -236,7 +237,7 @@ impl<'a> Camera<'a> {
         let Some(mut band) = self.bands.get(plane).copied() else { return Ok(()) };
         if band.row != Some(row) {
             band = Band { row: Some(row), ..Band::default() };
-            self.fill_sums(piece.is_chroma);
+            self.clear_sums(piece.is_chroma);
         }
         let rows = 1_u32.wrapping_shl(bits) >> plane;
         let in_band = image_row.wrapping_sub(self.top).wrapping_shr(u32::from(piece.is_chroma)) & rows.wrapping_sub(1);
@@ -261,7 +262,8 @@ impl<'a> Camera<'a> {
         Ok(())
     }
 
-    fn fill_sums(&mut self, is_chroma: bool) {
+    /// Begins new sums of the components of a plane.
+    fn clear_sums(&mut self, is_chroma: bool) {
         let is_planar = self.layout.is_planar();
         for [first, second, third] in self.sums.as_chunks_mut::<3>().0 {
             match (is_planar, is_chroma) {
@@ -277,17 +279,17 @@ impl<'a> Camera<'a> {
         let (format, is_planar, width) = (self.layout.format, self.layout.is_planar(), self.layout.map.width);
         let shift = self.layout.scale.bits().wrapping_mul(2);
         let half = 1_u16.wrapping_shl(shift) >> 1;
-        let mut view = self.view(row, 0, input);
+        let mut pixels = self.pixels(row, 0, input);
         let means = self.sums.as_chunks::<3>().0.iter().map(|sums| {
             // At most 64·255 + 32, shifted right by 6.
             sums.map(|sum| u8::try_from(sum.wrapping_add(half).wrapping_shr(shift)).unwrap_or(u8::MAX))
         });
         if is_planar {
-            Store { view, is_chroma }.visit(means, |yuv| yuv);
+            Store { pixels, is_chroma }.visit(means, |yuv| yuv);
             self.combine(row, is_chroma, 0..width.into(), input);
         } else {
             let colors = means.map(|components| format.color(components));
-            self.hash = self.hash.wrapping_add(view.write(colors));
+            self.hash = self.hash.wrapping_add(pixels.write(colors));
         }
         self.advance(row, is_chroma, width.into());
     }
@@ -296,8 +298,8 @@ impl<'a> Camera<'a> {
     fn combine(&mut self, row: u32, is_chroma: bool, columns: core::ops::Range<u32>, input: &mut [i8]) {
         let other = self.done(row, !is_chroma).map_or(0, |done| u32::from(*done));
         let count = other.min(columns.end).saturating_sub(columns.start);
-        let format: PixelFormat = self.layout.format;
-        let added = self.view(row, columns.start, input).convert(index(count), |yuv| format.color(yuv));
+        let format = self.layout.format;
+        let added = self.pixels(row, columns.start, input).convert(index(count), |yuv| format.color(yuv));
         self.hash = self.hash.wrapping_add(added);
     }
 
@@ -306,124 +308,4 @@ impl<'a> Camera<'a> {
             *done = u16::try_from(columns).unwrap_or(u16::MAX);
         }
     }
-}
-
-/// Pixels of the network's input, from one of the camera's on.
-struct View<'a> {
-    codes: &'a mut [i8],
-    channels: usize,
-    first_channel: usize,
-    /// Number of the first pixel within the map.
-    position: u32,
-}
-
-impl View<'_> {
-    /// Writes colors and returns their share of the frame's hash.
-    fn write(&mut self, colors: impl Iterator<Item = [u8; 3]>) -> u32 {
-        let mut hash = 0_u32;
-        let first = self.first_channel;
-        let mut pixels = self.codes.chunks_mut(self.channels.max(1)).zip(self.position..);
-        // From inside the iterator, which is faster where pixels come in pairs.
-        colors.for_each(|color| {
-            let Some((codes, position)) = pixels.next() else { return };
-            match codes.get_mut(first..) {
-                Some([red, green, blue, ..]) => [*red, *green, *blue] = color.map(code),
-                Some([grey, ..]) => [*grey, _, _] = color.map(code),
-                _ => {}
-            }
-            hash = hash.wrapping_add(share(color, position));
-        });
-        hash
-    }
-
-    /// Replaces stored components by colors and returns the share of the hash.
-    fn convert(&mut self, count: usize, color: impl Fn([u8; 3]) -> [u8; 3]) -> u32 {
-        let mut hash = 0_u32;
-        let pixels = self.codes.chunks_mut(self.channels.max(1)).take(count);
-        for (codes, position) in pixels.zip(self.position..) {
-            let Some([red, green, blue, ..]) = codes.get_mut(self.first_channel..) else { continue };
-            let rgb = color([*red, *green, *blue].map(level));
-            [*red, *green, *blue] = rgb.map(code);
-            hash = hash.wrapping_add(share(rgb, position));
-        }
-        hash
-    }
-}
-
-/// Writes the colors of pixels.
-struct Write<'a> {
-    view: View<'a>,
-    hash: &'a mut u32,
-}
-
-impl Visitor for Write<'_> {
-    fn visit(mut self, components: impl Iterator<Item = [u8; 3]>, color: impl Fn([u8; 3]) -> [u8; 3]) {
-        *self.hash = self.hash.wrapping_add(self.view.write(components.map(color)));
-    }
-}
-
-/// Stores the components of one plane, to be converted when the other has come.
-struct Store<'a> {
-    view: View<'a>,
-    is_chroma: bool,
-}
-
-impl Visitor for Store<'_> {
-    fn visit(self, components: impl Iterator<Item = [u8; 3]>, _: impl Fn([u8; 3]) -> [u8; 3]) {
-        let mut pixels = self.view.codes.chunks_mut(self.view.channels.max(1));
-        components.for_each(|components| {
-            let codes = pixels.next().and_then(|codes| codes.get_mut(self.view.first_channel..));
-            let Some([first, second, third, ..]) = codes else { return };
-            let [y, u, v] = components.map(code);
-            if self.is_chroma {
-                [*second, *third] = [u, v];
-            } else {
-                *first = y;
-            }
-        });
-    }
-}
-
-/// Adds components to the sums of the columns that they fall into.
-struct Add<'a> {
-    sums: &'a mut [u16],
-    column: u32,
-    bits: u32,
-    weight: u16,
-}
-
-impl Visitor for Add<'_> {
-    fn visit(self, components: impl Iterator<Item = [u8; 3]>, _: impl Fn([u8; 3]) -> [u8; 3]) {
-        let sums = self.sums.as_chunks_mut::<3>().0;
-        let mut column = self.column;
-        components.for_each(|components| {
-            if let Some(sums) = sums.get_mut(index(column.wrapping_shr(self.bits))) {
-                for (sum, component) in sums.iter_mut().zip(components) {
-                    *sum = sum.wrapping_add(self.weight.wrapping_mul(component.into()));
-                }
-            }
-            column = column.wrapping_add(1);
-        });
-    }
-}
-
-/// `u8 − 128`.
-#[inline]
-fn code(level: u8) -> i8 {
-    (level ^ 0x80).cast_signed()
-}
-
-/// The level of a code.
-#[inline]
-fn level(code: i8) -> u8 {
-    code.cast_unsigned() ^ 0x80
-}
-
-/// What a pixel adds to the hash of its frame: its color times an odd number drawn from its position, modulo 2^32. Sums
-/// do not depend on the order of rows; a change of one pixel always changes them, other changes hide with a
-/// probability of about 2^-32.
-#[inline]
-fn share([red, green, blue]: [u8; 3], position: u32) -> u32 {
-    let drawn = position.wrapping_mul(0x9E37_79B1);
-    u32::from_le_bytes([red, green, blue, 0]).wrapping_mul(drawn ^ (drawn >> 15) | 1)
 }
