@@ -125,11 +125,11 @@ impl<'a> Builder<'a> {
         self.push(module, Op::BatchNorm(op), &[input])
     }
 
-    /// 1×1 convolution with bias.
+    /// 1×1 convolution with bias: a linear layer for each position.
     pub(super) fn conv_1x1(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
         let inputs = usize::from(self.graph.value(input).shape.channels);
         let op = self.pointwise(module, inputs, outputs);
-        self.push(module, Op::Conv2d(op), &[input])
+        self.push(module, Op::Linear(op), &[input])
     }
 
     /// Linear layer with bias.

@@ -7,7 +7,7 @@ use super::builder::Builder;
 use super::detect::{common_length, indexed_count, most_common};
 use crate::error::Result;
 use crate::import::NamedTensors;
-use crate::ir::{Clip, Conv2d, LayerNorm, Linear, Op, Tokens, ValueId, Weights};
+use crate::ir::{Clip, LayerNorm, Linear, Op, Tokens, ValueId, Weights};
 use firmware::program::Window;
 use std::sync::Arc;
 
@@ -190,8 +190,8 @@ impl Block {
 
 /// The 1×1 convolutions of one map at one scale: to the width of a shared transformer, and back.
 struct Projections {
-    to: Conv2d,
-    back: Conv2d,
+    to: Linear,
+    back: Linear,
 }
 
 /// What fuses the maps of one scale.
@@ -229,7 +229,7 @@ impl Fusion {
     fn project(&self, b: &mut Builder<'_>, side: usize, map: ValueId) -> Result<ValueId> {
         let Some(projections) = &self.projections else { return Ok(map) };
         let (name, conv) = (SIDES[side], projections[side].to.clone());
-        let features = b.push(projection(name, "conv", self.scale), Op::Conv2d(conv), &[map])?;
+        let features = b.push(projection(name, "conv", self.scale), Op::Linear(conv), &[map])?;
         let size = b.graph.value(map).shape;
         let (height, width) = (size.height / self.transformer.grid.0, size.width / self.transformer.grid.1);
         if (height, width) == (1, 1) {
@@ -257,7 +257,7 @@ impl Fusion {
             branch = b.push(format!("{p}.upsample.{name}"), Op::ResizeBilinear { factor }, &[branch])?;
         }
         if let Some(projections) = &self.projections {
-            let conv = Op::Conv2d(projections[side].back.clone());
+            let conv = Op::Linear(projections[side].back.clone());
             branch = b.push(projection(name, "deconv", self.scale), conv, &[branch])?;
         }
         b.push(format!("{p}.add.{name}"), Op::Add { clip: Clip::NONE }, &[branch, map])
