@@ -110,7 +110,7 @@ mod tests {
         report.point_error_px = vec![4.12];
         let page = section(&[report], &[frame]).into_string();
         // The center of the last column and of the middle row, at two units per pixel; the first pixel's center.
-        for part in ["x=\"6\" y=\"0\"", "cx=\"1\" cy=\"1\"", "4.12 px apart", "image/png", "<td>integers</td>"] {
+        for part in ["x=\"6\" y=\"0\"", "cx=\"1\" cy=\"1\"", "4.12 px apart", "image/png", ">integers</td>"] {
             assert!(page.contains(part), "{part} in {page}");
         }
         assert!(section(&[], &[]).into_string().is_empty());
