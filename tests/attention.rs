@@ -133,8 +133,6 @@ fn a_missed_agreement_is_exit_status_one() {
     assert!(outcome.status == 0 && outcome.out.contains("gate min_agreement_percent met"), "{}", outcome.out);
     let outcome = project.host_sim(&format!("{both} --top 1 --min-agreement 100"));
     let (status, document) = project.json(&format!("{both} --top 1 --min-agreement 100 --json"));
-    let is_exact = document["agreement"]["keys_percent"] == 100.0;
-    assert!(!is_exact, "integers that agree on every key cannot miss a gate: choose another seed of the network");
     assert_eq!((outcome.status, status), (1, 1));
     assert!(outcome.err.contains("error: gate min_agreement_percent: least on frame inputs#"), "{}", outcome.err);
     assert_eq!((&document["error"]["code"], &document["gates"][0]["met"]), (&"check".into(), &false.into()));
