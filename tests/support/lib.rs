@@ -1,10 +1,11 @@
 //! Support for the integration tests.
 
-pub mod boards;
 pub mod agent;
+pub mod boards;
 pub mod build;
 pub mod bundle;
 pub mod commands;
+pub mod drive_log;
 pub mod every_step;
 pub mod golden;
 pub mod mutation;
