@@ -1,5 +1,5 @@
-//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `score`, `bench`, `schema`, `completions`, and the
-//! demo without any of them.
+//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `drive`, `score`, `bench`, `schema`, `completions`,
+//! and the demo without any of them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
@@ -10,7 +10,7 @@ use crate::files::FrameSource;
 use crate::gates::{self, Gates};
 use crate::noise::{self, Selection};
 use crate::report::{self, VerifyReport, html, json, terminal};
-use crate::{bench, demo, metrics, run, verify};
+use crate::{bench, demo, drive, metrics, run, verify};
 use attention::AttentionArgs;
 use clap::{Args, Parser, Subcommand};
 use indicatif::ProgressBar;
@@ -116,6 +116,28 @@ enum Command {
     Attention {
         #[command(flatten)]
         attention: AttentionArgs,
+        #[command(flatten)]
+        common: Common,
+    },
+    /// Replays a recorded sequence through sensors, network, planner and controller: steer, throttle and brake.
+    #[command(after_help = examples::DRIVE)]
+    Drive {
+        /// Model image.
+        #[arg(value_name = "OUT.img")]
+        image: PathBuf,
+        /// Folder with route.json and frames/<name>/{rgb.png, lidar.bin, frame.json}, a frame per 1/20 s.
+        #[arg(long, value_name = "DIR")]
+        log: PathBuf,
+        /// The checkpoint that the image was compiled from; without it only the integers drive.
+        #[arg(long, value_name = "MODEL")]
+        model: Option<PathBuf>,
+        #[command(flatten)]
+        import: ImportArgs,
+        #[command(flatten)]
+        backend: BackendArgs,
+        /// Write drive.html and drive.json to this folder.
+        #[arg(long, value_name = "DIR")]
+        report: Option<PathBuf>,
         #[command(flatten)]
         common: Common,
     },
@@ -339,6 +361,7 @@ impl Command {
             | Self::Bench { common, .. }
             | Self::Diff { common, .. }
             | Self::Attention { common, .. }
+            | Self::Drive { common, .. }
             | Self::Score { common, .. }
             | Self::Schema { common, .. } => Some(common),
             Self::Completions(_) => None,
@@ -388,6 +411,15 @@ impl Command {
                 Ok(0)
             }
             Self::Attention { attention, common } => attention.execute(&common, console, progress),
+            Self::Drive { image, log, model, import, backend, report: folder, common } => {
+                let (import, backend) = (import.options()?, backend.choose(&common)?);
+                let report = drive::drive(&drive::Options { image, log, model, import, backend }, progress)?;
+                if let Some(folder) = &folder {
+                    report::write_drive(folder, &report)?;
+                }
+                console.print(&if common.json { json::drive(&report).to_string() } else { terminal::drive(&report) });
+                Ok(0)
+            }
             Self::Score { logs, common } => {
                 let score = metrics::score(&logs)?;
                 console.print(&if common.json { json::score(&score).to_string() } else { terminal::score(&score) });

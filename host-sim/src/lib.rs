@@ -8,6 +8,7 @@
 //!   f32 network: how much precision each step costs
 //! * [`attention`]: how often the fusing transformer looks from one sensor to the other, in integers and in f32
 //! * [`metrics`]: how well a car drove, from the logs of whole routes
+//! * [`mod@drive`]: a recorded sequence through sensors, network, planner and controller, int8 beside f32
 //! * [`report`]: what was found, as text, JSON and one HTML page; [`diff`] against an earlier report, [`gates`] for CI,
 //!   and where the noise at the output comes from ([`noise`])
 //!
@@ -33,6 +34,7 @@ pub mod compare;
 pub mod controls;
 pub mod demo;
 pub mod diff;
+pub mod drive;
 pub mod files;
 pub mod gates;
 pub mod histogram;

@@ -14,6 +14,7 @@ use crate::classification::{ClassificationSummary, ClassifiedFrame};
 use crate::compare::StepDifference;
 use crate::controls::{ControlError, ControlPrediction};
 use crate::diff::Diff;
+use crate::drive::DriveReport;
 use crate::gates::GateOutcome;
 use crate::histogram::Histogram;
 use crate::noise::NoiseShares;
@@ -277,6 +278,17 @@ pub fn write(folder: &Path, report: &VerifyReport, frames: &[Frame]) -> Result<(
     let page = html::page(report, frames);
     let document = json::bytes(&json::verify(report));
     artifact::write_files(&[(&folder.join("report.html"), page.as_bytes()), (&folder.join("report.json"), &document)])
+}
+
+/// Writes `drive.html` and `drive.json` to a folder, which is made where it does not exist.
+///
+/// # Errors
+/// The folder or a file cannot be written; then neither is.
+pub fn write_drive(folder: &Path, report: &DriveReport) -> Result<()> {
+    std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, &e))?;
+    let page = html::drive_page(report);
+    let document = json::bytes(&json::drive(report));
+    artifact::write_files(&[(&folder.join("drive.html"), page.as_bytes()), (&folder.join("drive.json"), &document)])
 }
 
 /// Writes `attention.html` and `attention.json` to a folder, which is made where it does not exist.

@@ -5,6 +5,7 @@ pub mod boards;
 pub mod build;
 pub mod bundle;
 pub mod commands;
+pub mod drive_log;
 pub mod every_step;
 pub mod golden;
 pub mod mutation;

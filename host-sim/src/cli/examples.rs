@@ -11,6 +11,7 @@ Examples:
   host-sim bench transfuser.img
   host-sim ablate transfuser.pth --calib frames/ --frames drive/
   host-sim attention transfuser.img --model transfuser.pth --frames drive/
+  host-sim drive transfuser.img --log drive/
   host-sim score route-1.json route-2.json
   host-sim completions bash";
 
@@ -45,6 +46,11 @@ pub const ATTENTION: &str = "Examples:
   host-sim attention transfuser.img --model transfuser.pth --frames drive/ --report out/
   host-sim attention transfuser.img --frames drive/ --block encoder.transformer2
   host-sim attention transfuser.pth --frames drive/ --image-rows 3,4 --lidar-rows 5,6,7 --top 3 --json";
+
+pub const DRIVE: &str = "Examples:
+  host-sim drive transfuser.img --log drive/
+  host-sim drive transfuser.img --log drive/ --model transfuser.pth --report out/
+  host-sim drive transfuser.img --log drive/ --json";
 
 pub const SCORE: &str = "Examples:
   host-sim score route-1.json route-2.json

@@ -6,6 +6,7 @@
 use super::VerifyReport;
 use crate::attention::AttentionReport;
 use crate::diff::Diff;
+use crate::drive::DriveReport;
 use crate::gates::GateOutcome;
 use maud::{DOCTYPE, Markup, PreEscaped, html};
 use model_compiler::frames::Frame;
@@ -15,6 +16,7 @@ mod changes;
 mod channels;
 mod classes;
 mod controls;
+mod drive;
 mod frames;
 mod gates;
 mod graph;
@@ -78,6 +80,15 @@ pub fn attention_page(report: &AttentionReport, frames: &[Frame]) -> String {
         (attention::frames(report))
     };
     shell(&format!("Attention at {}", report.block), &body)
+}
+
+/// The page of a replayed log.
+pub fn drive_page(report: &DriveReport) -> String {
+    let body = html! {
+        (drive::summary(report))
+        (drive::controls(report))
+    };
+    shell(&format!("{} drives", report.model.name), &body)
 }
 
 fn shell(title: &str, body: &Markup) -> String {

@@ -5,6 +5,7 @@ use crate::ablation::Row;
 use crate::attention::AttentionReport;
 use crate::bench::figures::BenchReport;
 use crate::diff::Diff;
+use crate::drive::DriveReport;
 use crate::gates::GateOutcome;
 use crate::metrics::{RouteLog, Score};
 use crate::run::RunReport;
@@ -48,6 +49,8 @@ pub enum Document {
     Attention,
     /// Of scored drives.
     Score,
+    /// Of a replayed log.
+    Drive,
     /// The log of a drive, which is read.
     RouteLog,
 }
@@ -59,6 +62,7 @@ pub fn schema(document: Document) -> Value {
         Document::Verify => written().into_root_schema_for::<VerifyReport>(),
         Document::Attention => written().into_root_schema_for::<AttentionReport>(),
         Document::Score => written().into_root_schema_for::<Score>(),
+        Document::Drive => written().into_root_schema_for::<DriveReport>(),
         Document::RouteLog => SchemaSettings::default().into_generator().into_root_schema_for::<RouteLog>(),
     };
     schema.to_value()
@@ -115,6 +119,11 @@ pub fn attention(report: &AttentionReport) -> Value {
 /// Document of scored drives.
 pub fn score(score: &Score) -> Value {
     to_value(score)
+}
+
+/// Document of a replayed log.
+pub fn drive(report: &DriveReport) -> Value {
+    to_value(report)
 }
 
 /// Document of a measurement.

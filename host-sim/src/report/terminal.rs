@@ -11,10 +11,12 @@ use std::fmt::Write;
 
 mod attention;
 mod bench;
+mod drive;
 mod score;
 
 pub use attention::attention;
 pub use bench::bench;
+pub use drive::drive;
 pub use score::score;
 
 /// Changed steps that a terminal shows.

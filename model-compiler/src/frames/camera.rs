@@ -18,7 +18,10 @@ pub fn load(path: &Path, shape: Shape) -> Result<ByteMap> {
 }
 
 /// The pixels of an image file, told from its first bytes.
-pub(super) fn decode(path: &Path) -> Result<RgbImage> {
+///
+/// # Errors
+/// The file is missing or no readable image.
+pub fn decode(path: &Path) -> Result<RgbImage> {
     let reader = image::ImageReader::open(path).and_then(image::ImageReader::with_guessed_format);
     let decoded = reader.map_err(|e| Error::io(path, &e))?.decode();
     let refuse = |e: image::ImageError| {

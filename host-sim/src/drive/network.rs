@@ -1,0 +1,202 @@
+//! The two networks of a drive: the engine's integers, and the f32 network on the same inputs.
+
+use super::sensors::Rig;
+use crate::backends::Backend;
+use crate::buffers::GuardedArena;
+use crate::codes::decode;
+use crate::run::Waypoints;
+use firmware::drive::profile::Answer as AnswerKind;
+use firmware::drive::{NetworkError, NetworkOutput, System};
+use firmware::engine::{Engine, EngineError};
+use firmware::image::{Image, Port};
+use firmware::tensor::ElementType;
+use firmware::waypoint::{self, Waypoint};
+use model_compiler::error::{Error, ErrorCode, Result};
+use model_compiler::frames;
+use model_compiler::ir::Graph;
+use model_compiler::reference;
+
+/// What a network gave, owned.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Answer {
+    /// Waypoints.
+    Waypoints(Vec<Waypoint>),
+    /// Points in the image, `[column, row]` in 1/64 pixel.
+    ImagePoints(Vec<[i32; 2]>),
+    /// Logistic values in Q15.
+    Controls([i16; 3]),
+    /// Nothing that can be driven: a number that is not finite.
+    NotFinite,
+}
+
+impl Answer {
+    /// Reads the integers of the output that drives.
+    fn of_codes(kind: &AnswerKind, codes: &[i32]) -> Option<Self> {
+        let bytes: Vec<u8> = codes.iter().flat_map(|code| code.to_le_bytes()).collect();
+        match kind {
+            AnswerKind::Waypoints => waypoint::read(&bytes).map(|waypoints| Self::Waypoints(waypoints.to_vec())),
+            AnswerKind::ImagePoints(_) => Some(Self::ImagePoints(codes.as_chunks::<2>().0.to_vec())),
+            AnswerKind::Controls => {
+                let codes = <[i32; 3]>::try_from(codes).ok()?;
+                Some(Self::Controls(codes.map(|code| code.clamp(i16::MIN.into(), i16::MAX.into()) as i16)))
+            }
+        }
+    }
+
+    /// As the driver takes it.
+    ///
+    /// # Errors
+    /// There is nothing to drive by.
+    pub fn output(&self) -> std::result::Result<NetworkOutput<'_>, NetworkError> {
+        match self {
+            Self::Waypoints(waypoints) => Ok(NetworkOutput::Waypoints(waypoints)),
+            Self::ImagePoints(points) => Ok(NetworkOutput::ImagePoints(points)),
+            Self::Controls(codes) => Ok(NetworkOutput::Controls(*codes)),
+            Self::NotFinite => Err(NetworkError::Failed),
+        }
+    }
+
+    /// Waypoints in meters, where the network gives such.
+    pub fn waypoints(&self) -> Option<Waypoints> {
+        match self {
+            Self::Waypoints(waypoints) => {
+                Some(waypoints.iter().map(|w| [w.right, w.forward].map(|meters| meters.to_num())).collect())
+            }
+            _ => None,
+        }
+    }
+}
+
+/// The system of an image, from the names of its inputs.
+///
+/// # Errors
+/// They are those of no driving network.
+pub fn system(image: &Image<'_>) -> Result<System> {
+    let names: Vec<&str> = (0..image.input_count()).filter_map(|i| Some(image.input(i)?.name)).collect();
+    let reads = |name: &str| names.contains(&name);
+    match (reads("rgb"), reads("bev"), reads("goal")) {
+        _ if reads("views") => Ok(System::Lbc),
+        (true, false, false) if reads("command") => Ok(System::Cilrs),
+        (true, true, true) if reads("bev_points") => Ok(System::GeometricFusion),
+        (true, true, true) if reads("velocity") => Ok(System::TransFuser),
+        (true, true, true) => Ok(System::LateFusion),
+        (true, false, true) => Ok(System::Aim),
+        _ => {
+            let message = format!("it reads {}, which is no driving network's set of inputs", names.join(", "));
+            let error = Error::new(ErrorCode::Unsupported, format!("network {}", image.name()), message);
+            Err(error.with_help("host-sim run shows what other networks give"))
+        }
+    }
+}
+
+/// Name of the output that holds controls; waypoints and points are the first output.
+const CONTROLS: &str = "controls";
+
+/// An image on the engine.
+pub struct IntegerNetwork<'a> {
+    image: Image<'a>,
+    backend: Backend,
+    arena: GuardedArena,
+    kind: AnswerKind,
+    output: u8,
+    element: ElementType,
+}
+
+impl<'a> IntegerNetwork<'a> {
+    /// A network that answers so.
+    ///
+    /// # Errors
+    /// It has no output.
+    pub fn new(image: Image<'a>, backend: Backend, kind: AnswerKind) -> Result<Self> {
+        let controls = |&index: &_| image.output(index).is_some_and(|port| port.name == CONTROLS);
+        let output = (0..image.output_count()).find(controls).unwrap_or(0);
+        let record = image.output(output).and_then(|port| image.tensor(port.tensor));
+        let element = record.map(|record| record.element).ok_or_else(|| {
+            Error::new(ErrorCode::Unsupported, format!("network {}", image.name()), "it has no output")
+        })?;
+        let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
+        Ok(Self { image, backend, arena, kind, output, element })
+    }
+
+    /// One inference.
+    ///
+    /// # Errors
+    /// The engine refuses, or the output is none of a driving network.
+    pub fn infer(&mut self, inputs: &[Vec<u8>]) -> Result<Answer> {
+        let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
+        let refuse = |e: EngineError| Error::new(ErrorCode::Malformed, "engine", e.to_string());
+        let mut engine = Engine::new(self.image, self.backend.kernels(), self.arena.poisoned(0)).map_err(refuse)?;
+        engine.infer(&inputs).map_err(refuse)?;
+        let codes = decode(engine.output(self.output.into()).map_err(refuse)?, self.element);
+        Answer::of_codes(&self.kind, &codes).ok_or_else(|| unreadable(self.image.name()))
+    }
+}
+
+/// A graph in f32.
+pub struct FloatNetwork {
+    graph: Graph,
+    kind: AnswerKind,
+    output: usize,
+}
+
+impl FloatNetwork {
+    /// A graph with the inputs of the image.
+    ///
+    /// # Errors
+    /// The graph reads an input that the image does not have, or one of another size.
+    pub fn new(graph: Graph, kind: AnswerKind, rig: &Rig<'_>) -> Result<Self> {
+        let refuse = |message: String, help: &str| {
+            Err(Error::new(ErrorCode::Usage, format!("network {}", graph.name), message).with_help(help))
+        };
+        let inputs = || graph.inputs().map(|(id, input)| (frames::input_name(input), graph.value(id).shape));
+        if let Some((name, _)) = inputs().find(|(name, _)| rig.shape(name).is_none()) {
+            let help = "--model takes the checkpoint that the image was compiled from";
+            return refuse(format!("it reads `{name}`, which the image does not"), help);
+        }
+        for (name, expected) in inputs() {
+            let Some(found) = rig.shape(name).filter(|found| found.elements() != expected.elements()) else { continue };
+            let [expected, found] = [expected, found].map(|s| format!("{}×{}×{}", s.height, s.width, s.channels));
+            let help = "--resolution HxW gives the size that the image was compiled for";
+            return refuse(format!("its input `{name}` is {expected}, the image's {found}"), help);
+        }
+        let output = graph.outputs.iter().position(|&id| graph.value(id).name == CONTROLS).unwrap_or(0);
+        Ok(Self { graph, kind, output })
+    }
+
+    /// One inference on the real values of the image's inputs.
+    ///
+    /// # Errors
+    /// The graph cannot be run, or its output is none of a driving network.
+    pub fn infer(&self, rig: &Rig<'_>, inputs: &[Vec<u8>], image: &Image<'_>) -> Result<Answer> {
+        let raw = |name: &str| {
+            let found = rig.ports().zip(inputs).find(|(port, _)| port.name == name);
+            found.map_or_else(Vec::new, |(port, bytes)| real(port, bytes, image))
+        };
+        let inputs: Vec<Vec<f32>> = self.graph.inputs().map(|(_, kind)| raw(frames::input_name(kind))).collect();
+        let outputs = reference::run(&self.graph, &inputs, |_, _| ())?;
+        let values = outputs.get(self.output).map_or(&[][..], Vec::as_slice);
+        if !values.iter().all(|value| value.is_finite()) {
+            return Ok(Answer::NotFinite);
+        }
+        // To the codes of an image's output: Q16 meters, 1/64 pixel, Q15. A cast saturates.
+        let factor = match self.kind {
+            AnswerKind::Waypoints => 65536.0,
+            AnswerKind::ImagePoints(_) => 64.0,
+            AnswerKind::Controls => 32768.0,
+        };
+        let codes: Vec<i32> = values.iter().map(|&value| (f64::from(value) * factor + 0.5).floor() as i32).collect();
+        Answer::of_codes(&self.kind, &codes).ok_or_else(|| unreadable(&self.graph.name))
+    }
+}
+
+fn unreadable(network: &str) -> Error {
+    Error::new(ErrorCode::Unsupported, format!("network {network}"), "its output is none of a driving network")
+}
+
+/// Raw values of an input's codes. Of a histogram they are counts, as the frames of calibration hold them.
+fn real(port: &Port<'_>, bytes: &[u8], image: &Image<'_>) -> Vec<f32> {
+    let element = image.tensor(port.tensor).map_or(ElementType::I8, |record| record.element);
+    let scale = if port.name == "bev" { 1.0 } else { f64::from(port.scale) };
+    let real = |code: i32| (scale * (f64::from(code) - f64::from(port.zero_point))) as f32;
+    decode(bytes, element).into_iter().map(real).collect()
+}
