@@ -432,7 +432,11 @@ fn operator_changes() -> Vec<(Check, Change)> {
         ),
         (
             Check::StepElement,
-            Parts(|p| step!(p, at::SPATIAL_SOFTMAX, SpatialSoftmax, |s| s.input = TensorId(ids::SUM))),
+            Parts(|p| {
+                to_fresh_memory(p, &[ids::POINTS]);
+                let points = record(p, ids::POINTS);
+                (points.element, points.bytes) = (ElementType::I16, points.bytes / 2);
+            }),
         ),
         (Check::StepShape, Parts(|p| record(p, ids::POINTS).shape = Shape::tokens(4, 4))),
         (Check::StepPixels, Parts(|p| *p = spatial_softmax_alone(Shape::map(1, 257, 2)))),
