@@ -46,9 +46,9 @@ fn sample_is_accepted() {
     for (id, record) in parts.tensors.iter().enumerate() {
         assert_eq!(image.tensor(TensorId(id as u16)).as_ref(), Some(record));
     }
-    let goal = image.input(3).expect("four inputs");
+    let goal = image.input(3).expect("five inputs");
     assert_eq!((goal.name, goal.tensor.0, goal.scale), ("goal", ids::GOAL, 0.5));
-    assert!(image.input(4).is_none() && image.output(2).is_none());
+    assert!(image.input(5).is_none() && image.output(3).is_none());
     assert_eq!(image.output(0).expect("one output").name, "waypoints");
 }
 
@@ -303,7 +303,7 @@ fn engine_refuses_wrong_use() {
     let mut slices: Vec<&[u8]> = given.iter().map(Vec::as_slice).collect();
     assert_eq!(engine.step(), Err(EngineError::NotStarted));
     assert_eq!(engine.output(0), Err(EngineError::NotDone));
-    assert_eq!(engine.start(&slices[..3]), Err(EngineError::InputCount { found: 3, expected: 4 }));
+    assert_eq!(engine.start(&slices[..3]), Err(EngineError::InputCount { found: 3, expected: 5 }));
     slices[2] = &[0; 3];
     assert_eq!(engine.start(&slices), Err(EngineError::InputBytes { input: 2, found: 3, expected: 2 }));
     assert_eq!(engine.step(), Err(EngineError::NotStarted));
@@ -313,7 +313,7 @@ fn engine_refuses_wrong_use() {
     assert_eq!(engine.output(0), Err(EngineError::NotDone));
     engine.infer(&slices).expect("runs");
     assert_eq!(engine.step(), Ok(Progress::Done));
-    assert_eq!(engine.output(2), Err(EngineError::NoSuchOutput(2)));
+    assert_eq!(engine.output(3), Err(EngineError::NoSuchOutput(3)));
     assert_eq!(engine.output(0).expect("done").len(), 32);
 }
 

@@ -81,7 +81,7 @@ fn header_changes() -> Vec<(Check, Change)> {
         (Check::HeaderReserved, Sealed(|b| b[header::RESERVED_B.end - 1] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::REGIONS.end - 1] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::SECTIONS.end - 1] = 1)),
-        (Check::Features, Sealed(|b| b[header::FEATURES.start + 1] |= 0x80)),
+        (Check::Features, Sealed(|b| b[header::FEATURES.start + 3] |= 0x80)),
         (Check::Features, Sealed(|b| b[header::FEATURES.start + 4] |= 4)),
         (Check::Features, Sealed(|b| b[header::FEATURES.end - 1] |= 0x80)),
         (Check::StepCount, Sealed(|b| b[header::STEP_COUNT].fill(0))),
