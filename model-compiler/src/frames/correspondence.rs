@@ -43,7 +43,7 @@ pub struct Correspondence {
 /// Whether there are lists of this shape: square maps of which the image is a part, pairs.
 pub fn is_possible(shape: Shape) -> bool {
     let fits = (1..=IMAGE[1] as u16 / CELL as u16).contains(&shape.height);
-    fits && shape.height == shape.width && shape.channels > 0 && shape.channels % 2 == 0
+    fits && shape.height == shape.width && shape.channels > 0 && shape.channels.is_multiple_of(2)
 }
 
 /// The lists of all points; those that are not finite lie outside.

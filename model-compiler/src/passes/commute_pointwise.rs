@@ -170,7 +170,7 @@ mod tests {
             let between = with_bias(&mut graph, rgb, 5);
             change(&mut graph, between);
             let input = graph.value(rgb).shape;
-            if let Some(shape) = graph.nodes[1].op.output_shape(&[input]).ok() {
+            if let Ok(shape) = graph.nodes[1].op.output_shape(&[input]) {
                 graph.values[between.0 as usize].shape = shape;
             }
             let pooled = graph.push("pool", Op::AveragePool(Window::square(2, 2, 0)), &[between]).unwrap();
