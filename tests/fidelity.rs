@@ -1,5 +1,5 @@
-//! How close the integers come to f32: full-size networks, calibrated on the stored frames, evaluated on these and their
-//! mirror images.
+//! How close the integers come to f32: full-size networks, calibrated on the stored frames, evaluated on these and
+//! their mirror images.
 
 use host_sim::ablation::{Bench, Fidelity, Variant, variants};
 use model_compiler::frames::Frame;

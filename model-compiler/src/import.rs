@@ -200,8 +200,8 @@ pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
 
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
 ///
-/// Inputs are `rgb`, `bev`, `velocity`, `bev_points`, `cam_points` and `goal`, as far as the system has them, in raw units; the output is
-/// `waypoints`. Values carry the names of the checkpoint's modules.
+/// Inputs are `rgb`, `bev`, `velocity`, `bev_points`, `cam_points` and `goal`, as far as the system has them, in raw
+/// units; the output is `waypoints`. Values carry the names of the checkpoint's modules.
 ///
 /// # Errors
 /// `Unsupported`: no known system, one that is not supported, or sizes that do not fit together. `Tensors`: the list

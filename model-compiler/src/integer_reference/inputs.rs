@@ -5,9 +5,9 @@ use crate::ir::InputKind;
 
 /// Codes of one input from raw values (numerics, "Inputs").
 ///
-/// Raw units: an image holds 0..=255, a BEV histogram counts 0..=5, cells are numbered from 0, the velocity is in m/s and
-/// the goal in m. Images become `u8 − 128`, counts and cells stay as they are (all saturate, and a fraction rounds to the
-/// nearest integer, ties up, though none is expected); velocity becomes i16 Q8, the goal i32 Q16, both by
+/// Raw units: an image holds 0..=255, a BEV histogram counts 0..=5, cells are numbered from 0, the velocity is in m/s
+/// and the goal in m. Images become `u8 − 128`, counts and cells stay as they are (all saturate, and a fraction rounds
+/// to the nearest integer, ties up, though none is expected); velocity becomes i16 Q8, the goal i32 Q16, both by
 /// `floor(2^k·x + ½)`, saturated.
 pub fn encode_input(kind: InputKind, raw: &[f64]) -> Vec<f64> {
     let round = |x: f64| (x + 0.5).floor();
