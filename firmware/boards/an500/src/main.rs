@@ -1,10 +1,10 @@
-//! Cortex-M7 on Arm's MPS2 board as QEMU's `mps2-an500`: the model image lies in the PSRAM, as it would in a memory-mapped
-//! flash.
+//! Cortex-M7 on Arm's MPS2 board as QEMU's `mps2-an500`: the model image lies in the PSRAM, as it would in a
+//! memory-mapped flash.
 #![no_std]
 #![no_main]
 
-use board_support::image_memory::{self, Arena};
-use board_support::{mps2, program, semihosting};
+use board_support::arena::Arena;
+use board_support::{image_memory, mps2, program, semihosting};
 use cortex_m::singleton;
 use cortex_m_rt::entry;
 use firmware::kernels::Portable;

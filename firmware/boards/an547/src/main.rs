@@ -1,5 +1,5 @@
-//! Cortex-M55 on Arm's MPS3 board as QEMU's `mps3-an547`: model image and arena lie in the DDR, so that networks of full
-//! size run.
+//! Cortex-M55 on Arm's MPS3 board as QEMU's `mps3-an547`: model image and arena lie in the DDR, so that networks of
+//! full size run.
 #![no_std]
 #![no_main]
 
@@ -25,7 +25,8 @@ fn main() -> ! {
     // SAFETY: the board's first UART and its system counter, each made once.
     let (uart, counter) = unsafe { (CmsdkUart::new(UART), SystemCounter::new(COUNTER, COUNTER_HERTZ)) };
     let mut machine = Machine { name: "an547", uart, counter };
-    // SAFETY: DDR of the board that nothing else uses; this program never writes the image's part.
+    // SAFETY: both ranges are DDR of the board, apart from each other and from what the linker uses; any bytes are
+    // valid, no other reference to them exists, and nothing writes the image's.
     let (image, arena) =
         unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
     semihosting::exit(program::self_test::run(&mut machine, image, Portable, arena))

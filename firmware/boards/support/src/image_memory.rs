@@ -14,8 +14,3 @@ pub unsafe fn stored(base: usize, capacity: usize) -> &'static [u8] {
     let length = stated.and_then(|bytes| usize::try_from(bytes).ok()).unwrap_or(0);
     memory.get(..length).unwrap_or(memory)
 }
-
-/// Memory aligned as an engine's arena needs it.
-#[derive(Debug)]
-#[repr(align(64))]
-pub struct Arena<const BYTES: usize>(pub [u8; BYTES]);

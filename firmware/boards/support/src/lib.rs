@@ -4,6 +4,7 @@
 //! program answers.
 #![no_std]
 
+pub mod arena;
 pub mod counter;
 pub mod image_memory;
 pub mod machine;

@@ -61,7 +61,8 @@ extern "C" fn main() -> ! {
     // SAFETY: the board's UART, made once.
     let uart = unsafe { Pl011::new(UART) };
     let mut machine = Machine { name: "virt", uart, counter: GenericTimer };
-    // SAFETY: RAM of the board that nothing else uses; this program never writes the image's part.
+    // SAFETY: both ranges are RAM of the board, apart from each other and from what the linker uses; any bytes are
+    // valid, no other reference to them exists, and nothing writes the image's.
     let (image, arena) =
         unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
     semihosting::exit(program::self_test::run(&mut machine, image, Portable, arena))

@@ -18,7 +18,8 @@ pub fn spatial_softmax(args: &SpatialSoftmaxArgs<'_>, input: &[i16], points: &mu
     let channels = usize::from(args.shape.channels);
     let columns = usize::from(args.shape.width).saturating_mul(channels);
     let Some(table) = args.exp_table.first_chunk() else { return };
-    if columns == 0 || args.shape.elements() != input.len() as u64 || points.len() != 2 * channels {
+    let fits = args.shape.elements() == input.len() as u64 && points.len() == 2 * channels;
+    if channels == 0 || columns == 0 || !fits {
         return;
     }
     for (channel, point) in points.chunks_exact_mut(2).enumerate() {
