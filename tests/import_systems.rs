@@ -385,6 +385,18 @@ fn geometric_fusion_fuses_as_many_of_the_last_stages_as_it_is_told() {
         "m: --fusion-scales has no effect on transfuser\n  \
          help: leave it out; the tensors of other systems tell their scales"
     );
+    for scales in [0, 5, 255] {
+        let options = ImportOptions { fusion_scales: Some(scales), ..Default::default() };
+        let error = import("m", tensors.clone(), &options).unwrap_err();
+        assert_eq!(error.code, ErrorCode::Usage);
+        assert_eq!(
+            error.to_string(),
+            format!(
+                "m: --fusion-scales: found {scales}, expected 1 to 4\n  \
+                 help: it counts the stages that are fused, from the last; leave it out where all are"
+            )
+        );
+    }
 }
 
 #[test]

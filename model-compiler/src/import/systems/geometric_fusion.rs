@@ -33,7 +33,7 @@ pub(super) fn recognize(tensors: &NamedTensors) -> bool {
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let resolution = b.options.resolution.unwrap_or(DEFAULT_RESOLUTION);
     let grid = grid(resolution)?;
-    let first_scale = 5 - usize::from(b.options.fusion_scales.unwrap_or(4));
+    let fusion_scales = usize::from(b.options.fusion_scales.unwrap_or(4));
     let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
     let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);
@@ -52,7 +52,7 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     for (scale, (image_modules, lidar_modules)) in (1..).zip(image_side.iter().zip(&lidar_side)) {
         image = image_network.stage(b, scale, image)?;
         lidar = lidar_network.stage(b, scale, lidar)?;
-        if scale < first_scale {
+        if scale + fusion_scales <= 4 {
             continue;
         }
         let from_image = image_modules.embed(b, image, grid)?;
