@@ -9,7 +9,6 @@ use super::has;
 use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::{Clip, LayerNorm, Linear, Op, Tokens, ValueId, Weights};
-use firmware::program::Window;
 use std::sync::Arc;
 
 /// As published.
@@ -49,10 +48,10 @@ pub(super) struct Fusions {
     widths: [usize; 4],
     grid: (u16, u16),
     /// Per scale.
+    is_fused: [bool; 4],
     /// Positional embeddings belong to all transformers or to none (the ablation without them; where it kept its unused
     /// zeros in the checkpoint, adding them changes nothing).
     has_position: bool,
-    is_fused: [bool; 4],
     /// The transformer of all scales, with its width.
     shared: Option<(Transformer, usize)>,
 }
@@ -230,14 +229,7 @@ impl Fusion {
         let Some(projections) = &self.projections else { return Ok(map) };
         let (name, conv) = (SIDES[side], projections[side].to.clone());
         let features = b.push(projection(name, "conv", self.scale), Op::Linear(conv), &[map])?;
-        let size = b.graph.value(map).shape;
-        let (height, width) = (size.height / self.transformer.grid.0, size.width / self.transformer.grid.1);
-        if (height, width) == (1, 1) {
-            return Ok(features);
-        }
-        let cell = Window { kernel_h: height as u8, kernel_w: width as u8, ..Window::square(1, 1, 0) };
-        let window = Window { stride_h: cell.kernel_h, stride_w: cell.kernel_w, ..cell };
-        b.push(format!("encoder.{name}_embedding{}", self.scale), Op::AveragePool(window), &[features])
+        b.pooled_to(format!("encoder.{name}_embedding{}", self.scale), features, self.transformer.grid)
     }
 
     /// Final LayerNorm of one map's tokens, enlarged to the map's size and added to it.
@@ -249,13 +241,10 @@ impl Fusion {
         stream: ValueId,
         map: ValueId,
     ) -> Result<ValueId> {
-        let (p, name, grid) = (prefix(self.scale), SIDES[side], self.transformer.grid);
+        let (p, name) = (prefix(self.scale), SIDES[side]);
         let mut branch = b.push(format!("{p}.ln_f.{name}"), Op::LayerNorm(norm), &[stream])?;
         let size = b.graph.value(map).shape;
-        let factor = (size.height / grid.0, size.width / grid.1);
-        if factor != (1, 1) {
-            branch = b.push(format!("{p}.upsample.{name}"), Op::ResizeBilinear { factor }, &[branch])?;
-        }
+        branch = b.enlarged_to(format!("{p}.upsample.{name}"), branch, (size.height, size.width))?;
         if let Some(projections) = &self.projections {
             let conv = Op::Linear(projections[side].back.clone());
             branch = b.push(projection(name, "deconv", self.scale), conv, &[branch])?;
