@@ -251,7 +251,7 @@ fn calibration_that_is_missing() {
     refused(
         &folder,
         "model-compiler compile @net.safetensors --calib @frames -o @new.img",
-        "@frames: holds no frame folder\n  help: expected FRAMES/<name>/{rgb.png, lidar.bin, frame.json}; give the folder above",
+        "@frames: holds no frame folder\n  help: expected FRAMES/<name>/{rgb.png, rgb_left.png, rgb_right.png (lbc), lidar.bin, frame.json}; give the folder above",
     );
     refused(
         &folder,
@@ -323,37 +323,37 @@ fn frame_folders_with_damaged_files() {
     broken(
         "frame.json",
         b"{\"speed\": 1.5, \"goal\": ",
-        "@frames/a/frame.json: not JSON: EOF while parsing a value at line 1 column 23\n  help: expected {\"speed\": m/s, \"goal\": [right_m, forward_m]}, optionally \"command\", \"lidar_axes\", \"lidar_height_m\"",
+        "@frames/a/frame.json: not JSON: EOF while parsing a value at line 1 column 23\n  help: fields, as far as the network reads them: \"speed\": m/s, \"goal\": [right_m, forward_m], \"command\": 1..6; optionally \"lidar_axes\", \"lidar_height_m\"",
     );
     broken(
         "frame.json",
         b"{\"goal\": [1, 2]}",
-        "@frames/a/frame.json: `speed`: missing, expected a number\n  help: expected {\"speed\": m/s, \"goal\": [right_m, forward_m]}, optionally \"command\", \"lidar_axes\", \"lidar_height_m\"",
+        "@frames/a/frame.json: `speed`: missing, expected a number\n  help: fields, as far as the network reads them: \"speed\": m/s, \"goal\": [right_m, forward_m], \"command\": 1..6; optionally \"lidar_axes\", \"lidar_height_m\"",
     );
     broken(
         "frame.json",
         b"{\"speed\": \"fast\", \"goal\": [1, 2]}",
-        "@frames/a/frame.json: `speed`: found \"fast\", expected a number\n  help: expected {\"speed\": m/s, \"goal\": [right_m, forward_m]}, optionally \"command\", \"lidar_axes\", \"lidar_height_m\"",
+        "@frames/a/frame.json: `speed`: found \"fast\", expected a number\n  help: fields, as far as the network reads them: \"speed\": m/s, \"goal\": [right_m, forward_m], \"command\": 1..6; optionally \"lidar_axes\", \"lidar_height_m\"",
     );
     broken(
         "frame.json",
         b"{\"speed\": 1, \"goal\": [1]}",
-        "@frames/a/frame.json: `goal`: found [1], expected [right_m, forward_m]\n  help: expected {\"speed\": m/s, \"goal\": [right_m, forward_m]}, optionally \"command\", \"lidar_axes\", \"lidar_height_m\"",
+        "@frames/a/frame.json: `goal`: found [1], expected [right_m, forward_m]\n  help: fields, as far as the network reads them: \"speed\": m/s, \"goal\": [right_m, forward_m], \"command\": 1..6; optionally \"lidar_axes\", \"lidar_height_m\"",
     );
     broken(
         "frame.json",
         b"{\"speed\": 1, \"goal\": [1, 2], \"command\": 7}",
-        "@frames/a/frame.json: `command`: found 7, expected 1..6\n  help: expected {\"speed\": m/s, \"goal\": [right_m, forward_m]}, optionally \"command\", \"lidar_axes\", \"lidar_height_m\"",
+        "@frames/a/frame.json: `command`: found 7, expected 1..6\n  help: fields, as far as the network reads them: \"speed\": m/s, \"goal\": [right_m, forward_m], \"command\": 1..6; optionally \"lidar_axes\", \"lidar_height_m\"",
     );
     broken(
         "frame.json",
         b"{\"speed\": 1, \"goal\": [1, 2], \"lidar_axes\": \"ned\"}",
-        "@frames/a/frame.json: `lidar_axes`: found \"ned\", expected \"carla\" or \"velodyne\"\n  help: expected {\"speed\": m/s, \"goal\": [right_m, forward_m]}, optionally \"command\", \"lidar_axes\", \"lidar_height_m\"",
+        "@frames/a/frame.json: `lidar_axes`: found \"ned\", expected \"carla\" or \"velodyne\"\n  help: fields, as far as the network reads them: \"speed\": m/s, \"goal\": [right_m, forward_m], \"command\": 1..6; optionally \"lidar_axes\", \"lidar_height_m\"",
     );
     broken(
         "frame.json",
         b"[1, 2]",
-        "@frames/a/frame.json: found no JSON object\n  help: expected {\"speed\": m/s, \"goal\": [right_m, forward_m]}, optionally \"command\", \"lidar_axes\", \"lidar_height_m\"",
+        "@frames/a/frame.json: found no JSON object\n  help: fields, as far as the network reads them: \"speed\": m/s, \"goal\": [right_m, forward_m], \"command\": 1..6; optionally \"lidar_axes\", \"lidar_height_m\"",
     );
     std::fs::remove_file(folder.path("frames/a/lidar.bin")).unwrap();
     refused(&folder, run, "@frames/a/lidar.bin: No such file or directory (os error 2)\n  help: check the path");

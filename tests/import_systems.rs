@@ -101,7 +101,9 @@ fn published_lbc_has_the_published_size_at_both_resolutions() {
             assert_eq!((graph.macs() as f64 / 1e7).round() / 1e2, giga_macs);
             optimize(&mut graph).unwrap();
         }
-        assert_eq!((count(&graph, "conv2d"), count(&graph, "batch_norm"), count(&graph, "relu")), (61, 0, 0));
+        // The last convolution is pointwise, with a bias: a linear layer.
+        let operators = ["conv2d", "linear", "batch_norm", "relu"].map(|operator| count(&graph, operator));
+        assert_eq!(operators, [60, 1, 0, 0]);
     }
 }
 
@@ -385,6 +387,18 @@ fn geometric_fusion_fuses_as_many_of_the_last_stages_as_it_is_told() {
         "m: --fusion-scales has no effect on transfuser\n  \
          help: leave it out; the tensors of other systems tell their scales"
     );
+    for scales in [0, 5, 255] {
+        let options = ImportOptions { fusion_scales: Some(scales), ..Default::default() };
+        let error = import("m", tensors.clone(), &options).unwrap_err();
+        assert_eq!(error.code, ErrorCode::Usage);
+        assert_eq!(
+            error.to_string(),
+            format!(
+                "m: --fusion-scales: found {scales}, expected 1 to 4\n  \
+                 help: it counts the stages that are fused, from the last; leave it out where all are"
+            )
+        );
+    }
 }
 
 #[test]
@@ -455,17 +469,28 @@ fn all_wrong_tensors_are_listed_at_once() {
     assert_eq!(error.code, ErrorCode::Tensors);
     let expected = "\
 model.pth: 9 tensors do not fit the system transfuser:
-  encoder.transformer1.pos_emb                              inf at index 3                expected [1, 8, 8]
-  encoder.transformer3.blocks.1.attn.query.weight           missing                       expected [24, 24]
   encoder.image_encoder.features.bn1.running_var            negative variance at index 2  expected [8]
+  encoder.transformer1.pos_emb                              inf at index 3                expected [1, 8, 8]
   encoder.image_encoder.features.layer2.0.bn1.running_mean  missing                       expected [16]
   encoder.lidar_encoder._model.layer3.0.conv2.weight        found [24, 24, 1, 1]          expected [24, 24, 3, 3]
+  encoder.transformer3.blocks.1.attn.query.weight           missing                       expected [24, 24]
   join.2.bias                                               found [17]                    expected [16]
   decoder.weight_hh                                         NaN at index 7                expected [48, 16]
   output.bias                                               found integers [2]            expected [2]
   encoder.image_encoder.features.fc.weight                  found [1000, 32]              surplus
   help: the checkpoint must hold exactly the network's tensors; --system overrides the detection";
     assert_eq!(error.to_string(), expected);
+}
+
+#[test]
+fn a_positional_embedding_that_only_the_last_scale_lacks_is_listed() {
+    let mut tensors = Network::small(System::TransFuser).tensors();
+    tensors.remove("encoder.transformer4.pos_emb");
+    let error = import("m", tensors, &ImportOptions::default()).unwrap_err();
+    assert_eq!(
+        error.message,
+        "1 tensor does not fit the system transfuser:\n  encoder.transformer4.pos_emb  missing  expected [1, 8, 32]"
+    );
 }
 
 #[test]

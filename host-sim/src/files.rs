@@ -196,7 +196,7 @@ pub fn frame_format(image: &Image<'_>) -> Result<FrameFormat> {
 /// # Errors
 /// The name is unknown, and it is no image.
 pub fn input_kind(port: &Port<'_>) -> Result<InputKind> {
-    let named = frames::INPUT_KINDS.into_iter().find(|&kind| frames::input_name(kind) == port.name);
+    let named = InputKind::ALL.into_iter().find(|kind| kind.name() == port.name);
     let is_image = port.scale == 1.0 && port.zero_point == -128;
     named.or(is_image.then_some(InputKind::Image)).ok_or_else(|| {
         Error::new(ErrorCode::Unsupported, format!("input `{}`", port.name), "no sensor gives this input")

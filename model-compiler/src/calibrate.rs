@@ -48,7 +48,7 @@ impl ValueStatistics {
         (((x - self.min) / span * BINS as f64) as usize).min(BINS - 1)
     }
 
-    /// One of `forms` forms of a value.
+    /// Adds one frame's values; `form` is the branch, 0 where nothing is selected.
     fn see_extremes(&mut self, data: &[f32], channels: usize, form: usize, forms: usize) {
         if self.count == 0 {
             (self.min, self.max) = (f64::INFINITY, f64::NEG_INFINITY);

@@ -121,8 +121,8 @@ pub struct ImportArgs {
     /// Stages that a Geometric Fusion checkpoint fuses, counted from the last (no tensor tells) [default: 4].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(1..=4))]
     fusion_scales: Option<u8>,
-    /// Height and width of the network's image and BEV inputs; told from the file where it tells it, else 256x256 for
-    /// a checkpoint; an ONNX file of dynamic size needs it.
+    /// Height and width of the network's image, views and BEV inputs; told from the file where it tells it, else as
+    /// published: 256x256, of lbc 144x256; an ONNX file of dynamic size needs it.
     #[arg(long, value_name = "HxW")]
     resolution: Option<Resolution>,
     /// Mean of an ONNX network's image, one value or one per channel: the network reads (grey level * SCALE - MEAN) /

@@ -58,7 +58,7 @@ impl FrameFormat {
     pub fn new(system: &str, inputs: impl IntoIterator<Item = (InputKind, Shape)>) -> Self {
         let mut format = Self {
             image: None,
-            image_name: input_name(InputKind::Image).into(),
+            image_name: InputKind::Image.name().into(),
             classes: None,
             resize: None,
             bev: None,
@@ -183,11 +183,7 @@ impl Frame {
             InputKind::Views => self.views.as_ref().map(|views| views.data.clone()),
         };
         values.ok_or_else(|| {
-            Error::new(
-                ErrorCode::Frames,
-                format!("frame {}", self.name),
-                format!("holds no {} input", input_name(kind)),
-            )
+            Error::new(ErrorCode::Frames, format!("frame {}", self.name), format!("holds no {} input", kind.name()))
         })
     }
 
@@ -211,9 +207,9 @@ impl Frame {
     /// calibration runs a frame under every command.
     pub fn digest(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
-        for kind in INPUT_KINDS.into_iter().filter(|&kind| kind != InputKind::Command) {
+        for kind in InputKind::ALL.into_iter().filter(|&kind| kind != InputKind::Command) {
             if let Ok(values) = self.raw(kind) {
-                hash.update(input_name(kind));
+                hash.update(kind.name());
                 values.iter().for_each(|v| hash.update(v.to_le_bytes()));
             }
         }
@@ -223,32 +219,6 @@ impl Frame {
     /// The first 16 hexadecimal digits of [`Self::digest`]: how provenance names a frame.
     pub fn short_digest(&self) -> String {
         self.digest()[..8].iter().map(|byte| format!("{byte:02x}")).collect()
-    }
-}
-
-/// Every kind of network input.
-pub const INPUT_KINDS: [InputKind; 8] = [
-    InputKind::Image,
-    InputKind::Bev,
-    InputKind::Velocity,
-    InputKind::Goal,
-    InputKind::BevPoints,
-    InputKind::CameraPoints,
-    InputKind::Command,
-    InputKind::Views,
-];
-
-/// Name of a network input, as ports carry it.
-pub fn input_name(kind: InputKind) -> &'static str {
-    match kind {
-        InputKind::Image => "rgb",
-        InputKind::Bev => "bev",
-        InputKind::Velocity => "velocity",
-        InputKind::Goal => "goal",
-        InputKind::BevPoints => "bev_points",
-        InputKind::CameraPoints => "cam_points",
-        InputKind::Command => "command",
-        InputKind::Views => "views",
     }
 }
 

@@ -174,8 +174,9 @@ pub struct ImportOptions {
     pub heads: Option<u16>,
     /// Geometric Fusion: how many of the last stages are fused, 1..=4; all when absent. No tensor tells.
     pub fusion_scales: Option<u8>,
-    /// Height and width of camera image and LiDAR histogram, pixels. When absent: 32 pixels per token where a square
-    /// positional embedding tells the token grid, else 256×256; for ONNX what the file says.
+    /// Height and width of image, views and BEV inputs, pixels. When absent: 32 pixels per token where a square
+    /// positional embedding tells the token grid, else as published: 256×256, of LBC 144×256; for ONNX what the file
+    /// says.
     pub resolution: Option<(u16, u16)>,
     /// ONNX: mean and deviation of the image in grey levels 0..=255, one value for all channels or one for each. When
     /// absent: ImageNet's for three channels, 0 and 255 (so 0..1) for one.

@@ -63,6 +63,34 @@ pub enum InputKind {
     Views,
 }
 
+impl InputKind {
+    /// Every kind.
+    pub const ALL: [Self; 8] = [
+        Self::Image,
+        Self::Bev,
+        Self::Velocity,
+        Self::Goal,
+        Self::BevPoints,
+        Self::CameraPoints,
+        Self::Command,
+        Self::Views,
+    ];
+
+    /// Name of a network input of this kind, as ports carry it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Image => "rgb",
+            Self::Bev => "bev",
+            Self::Velocity => "velocity",
+            Self::Goal => "goal",
+            Self::BevPoints => "bev_points",
+            Self::CameraPoints => "cam_points",
+            Self::Command => "command",
+            Self::Views => "views",
+        }
+    }
+}
+
 /// Bounds of a result: `min(max(x, min), max)`. ReLU is `0..∞`, ReLU6 `0..6`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Clip {
@@ -413,5 +441,17 @@ impl Op {
     /// Says which operand does not fit and what was expected.
     pub fn output_shape(&self, inputs: &[Shape]) -> Result<Shape, String> {
         verify::output_shape(self, inputs)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeSet;
+
+    #[test]
+    fn every_kind_of_input_has_a_name_of_its_own() {
+        let names: BTreeSet<_> = InputKind::ALL.into_iter().map(InputKind::name).collect();
+        assert_eq!(names.len(), InputKind::ALL.len(), "{names:?}");
     }
 }

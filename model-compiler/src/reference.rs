@@ -50,8 +50,9 @@ impl Activations {
 /// Runs a graph and returns its outputs; a value is dropped after its last use.
 ///
 /// `inputs` are raw, in the order of [`Graph::inputs`]: image and views 0..=255 and BEV counts 0..=5, all
-/// `height × width × channels`; velocity `[m/s]`; goal `[right, forward-negative]` in m; command `[1, 2, …]`. `observe`
-/// sees every node with its output, in order (for a BEV input that is counts / 5).
+/// `height × width × channels`; velocity `[m/s]`; goal `[right, forward-negative]` in m; `bev_points` and `cam_points`
+/// per cell of their map cells `[row, column]…` of the other, from 0; command `[1, 2, …]`. `observe` sees every node
+/// with its output, in order (for a BEV input that is counts / 5).
 ///
 /// # Errors
 /// The number or a length of the inputs is wrong, or the graph breaks an invariant of [`crate::ir`].

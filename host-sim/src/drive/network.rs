@@ -12,7 +12,6 @@ use firmware::image::{Image, Port};
 use firmware::tensor::ElementType;
 use firmware::waypoint::{self, Waypoint};
 use model_compiler::error::{Error, ErrorCode, Result};
-use model_compiler::frames;
 use model_compiler::ir::Graph;
 use model_compiler::reference;
 
@@ -148,7 +147,7 @@ impl FloatNetwork {
         let refuse = |message: String, help: &str| {
             Err(Error::new(ErrorCode::Usage, format!("network {}", graph.name), message).with_help(help))
         };
-        let inputs = || graph.inputs().map(|(id, input)| (frames::input_name(input), graph.value(id).shape));
+        let inputs = || graph.inputs().map(|(id, input)| (input.name(), graph.value(id).shape));
         if let Some((name, _)) = inputs().find(|(name, _)| rig.shape(name).is_none()) {
             let help = "--model takes the checkpoint that the image was compiled from";
             return refuse(format!("it reads `{name}`, which the image does not"), help);
@@ -172,7 +171,7 @@ impl FloatNetwork {
             let found = rig.ports().zip(inputs).find(|(port, _)| port.name == name);
             found.map_or_else(Vec::new, |(port, bytes)| real(port, bytes, image))
         };
-        let inputs: Vec<Vec<f32>> = self.graph.inputs().map(|(_, kind)| raw(frames::input_name(kind))).collect();
+        let inputs: Vec<Vec<f32>> = self.graph.inputs().map(|(_, kind)| raw(kind.name())).collect();
         let outputs = reference::run(&self.graph, &inputs, |_, _| ())?;
         let values = outputs.get(self.output).map_or(&[][..], Vec::as_slice);
         if !values.iter().all(|value| value.is_finite()) {

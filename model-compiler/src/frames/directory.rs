@@ -12,8 +12,10 @@ const IMAGE: &str = "rgb.png";
 const VIEWS: [&str; 3] = [IMAGE, "rgb_left.png", "rgb_right.png"];
 const LIDAR: &str = "lidar.bin";
 const DESCRIPTION: &str = "frame.json";
-const DESCRIPTION_HELP: &str =
-    r#"expected {"speed": m/s, "goal": [right_m, forward_m]}, optionally "command", "lidar_axes", "lidar_height_m""#;
+const DESCRIPTION_HELP: &str = concat!(
+    r#"fields, as far as the network reads them: "speed": m/s, "goal": [right_m, forward_m], "command": 1..6; "#,
+    r#"optionally "lidar_axes", "lidar_height_m""#
+);
 /// x, y, z, intensity as little-endian f32.
 const POINT_BYTES: usize = 16;
 
@@ -22,7 +24,10 @@ pub(super) fn load(path: &Path, format: &FrameFormat) -> Result<Vec<Frame>> {
     let folders = frame_folders(path)?;
     if folders.is_empty() {
         let error = Error::new(ErrorCode::Frames, path.display().to_string(), "holds no frame folder");
-        return Err(error.with_help("expected FRAMES/<name>/{rgb.png, lidar.bin, frame.json}; give the folder above"));
+        return Err(error.with_help(
+            "expected FRAMES/<name>/{rgb.png, rgb_left.png, rgb_right.png (lbc), lidar.bin, frame.json}; give the \
+             folder above",
+        ));
     }
     folders.iter().map(|folder| load_frame(folder, format)).collect()
 }
@@ -80,8 +85,7 @@ fn read_views(folder: &Path, shape: Shape, description: &Description) -> Result<
             shape.channels,
             views::CHANNELS
         );
-        let error = Error::new(ErrorCode::Frames, folder.display().to_string(), message);
-        return Err(error.with_help("feed it with a .safetensors file"));
+        return Err(only_tensors(folder, message));
     }
     let load = |file: &str| camera::load(&folder.join(file), Shape::map(shape.height, shape.width, 3));
     let [front, left, right] = VIEWS.map(load);
@@ -93,14 +97,19 @@ fn wrong_histogram_size(folder: &Path, shape: Shape) -> Error {
         "the network reads a {}×{}×{} histogram, frame folders give powers of two up to 1024 and 2 channels",
         shape.height, shape.width, shape.channels
     );
-    Error::new(ErrorCode::Frames, folder.display().to_string(), message).with_help("feed it with a .safetensors file")
+    only_tensors(folder, message)
 }
 
-fn wrong_grid(folder: &Path, shape: firmware::tensor::Shape) -> Error {
+fn wrong_grid(folder: &Path, shape: Shape) -> Error {
     let message = format!(
         "the network gathers {}×{} cells by {} numbers each, frame folders give pairs for 1×1 to 9×9 cells",
         shape.height, shape.width, shape.channels
     );
+    only_tensors(folder, message)
+}
+
+/// Frame folders cannot give what the network reads.
+fn only_tensors(folder: &Path, message: String) -> Error {
     Error::new(ErrorCode::Frames, folder.display().to_string(), message).with_help("feed it with a .safetensors file")
 }
 

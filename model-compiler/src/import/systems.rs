@@ -63,6 +63,11 @@ pub(super) fn build(system: System, name: &str, tensors: NamedTensors, options: 
         return Err(Error::new(ErrorCode::Usage, "", message)
             .with_help("leave it out; the tensors of other systems tell their scales"));
     }
+    if let Some(scales) = options.fusion_scales.filter(|scales| !(1..=4).contains(scales)) {
+        let message = format!("--fusion-scales: found {scales}, expected 1 to 4");
+        return Err(Error::new(ErrorCode::Usage, "", message)
+            .with_help("it counts the stages that are fused, from the last; leave it out where all are"));
+    }
     if system != System::Lbc && (options.hack || options.temperature.is_some()) {
         let message = format!("--hack and --temperature have no effect on {}", system.name());
         return Err(Error::new(ErrorCode::Usage, "", message).with_help("leave them out; they belong to lbc"));

@@ -132,6 +132,43 @@ impl<'a> Builder<'a> {
         self.push(module, Op::Linear(op), &[input])
     }
 
+    /// The mean of equal windows, one for each of so many rows and columns, which divide the map's; a map of that size
+    /// stays as it is.
+    pub(super) fn pooled_to(
+        &mut self,
+        name: impl Into<String>,
+        map: ValueId,
+        (rows, columns): (u16, u16),
+    ) -> Result<ValueId> {
+        let size = self.graph.value(map).shape;
+        let (height, width) = (size.height / rows, size.width / columns);
+        if (height, width) == (1, 1) {
+            return Ok(map);
+        }
+        let name = name.into();
+        let (Ok(kernel_h), Ok(kernel_w)) = (u8::try_from(height), u8::try_from(width)) else {
+            let message = format!("found windows of {height}×{width}, expected at most {0}×{0}", u8::MAX);
+            return Err(Error::new(ErrorCode::Unsupported, format!("average_pool {name}"), message));
+        };
+        let window = Window { kernel_h, kernel_w, stride_h: kernel_h, stride_w: kernel_w, ..Window::square(1, 1, 0) };
+        self.push(name, Op::AveragePool(window), &[map])
+    }
+
+    /// A map enlarged to a height and width, multiples of its own; one of that size stays as it is.
+    pub(super) fn enlarged_to(
+        &mut self,
+        name: impl Into<String>,
+        map: ValueId,
+        (height, width): (u16, u16),
+    ) -> Result<ValueId> {
+        let size = self.graph.value(map).shape;
+        let factor = (height / size.height, width / size.width);
+        if factor == (1, 1) {
+            return Ok(map);
+        }
+        self.push(name, Op::ResizeBilinear { factor }, &[map])
+    }
+
     /// Linear layer with bias.
     pub(super) fn linear(&mut self, module: &str, input: ValueId, outputs: usize) -> Result<ValueId> {
         let inputs = usize::from(self.graph.value(input).shape.channels);
@@ -155,5 +192,28 @@ impl<'a> Builder<'a> {
             first_row: 0,
             grid,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn maps_are_pooled_and_enlarged_to_a_size_unless_they_have_it() {
+        let options = ImportOptions::default();
+        let mut b = Builder::new("m", System::TransFuser, NamedTensors::default(), &options);
+        let map = b.graph.push_input("map", InputKind::Image, Shape::map(8, 6, 3));
+        let pooled = b.pooled_to("pooled", map, (2, 6)).unwrap();
+        assert_eq!(b.graph.value(pooled).shape, Shape::map(2, 6, 3));
+        let enlarged = b.enlarged_to("enlarged", pooled, (8, 12)).unwrap();
+        assert_eq!(b.graph.value(enlarged).shape, Shape::map(8, 12, 3));
+        assert_eq!(b.pooled_to("same", map, (8, 6)).unwrap(), map);
+        assert_eq!(b.enlarged_to("same", map, (8, 6)).unwrap(), map);
+        let high = b.graph.push_input("high", InputKind::Image, Shape::map(256, 1, 3));
+        assert_eq!(
+            b.pooled_to("column", high, (1, 1)).unwrap_err().to_string(),
+            "average_pool column: found windows of 256×1, expected at most 255×255"
+        );
     }
 }

@@ -13,7 +13,6 @@ use super::{DEFAULT_RESOLUTION, has, head};
 use crate::error::{Error, ErrorCode, Result};
 use crate::import::NamedTensors;
 use crate::ir::{Clip, InputKind, Linear, Op, Shape, ValueId};
-use firmware::program::Window;
 
 const IMAGE: &str = "encoder.image_encoder.features";
 const LIDAR: &str = "encoder.lidar_encoder._model";
@@ -33,7 +32,7 @@ pub(super) fn recognize(tensors: &NamedTensors) -> bool {
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let resolution = b.options.resolution.unwrap_or(DEFAULT_RESOLUTION);
     let grid = grid(resolution)?;
-    let first_scale = 5 - usize::from(b.options.fusion_scales.unwrap_or(4));
+    let fusion_scales = usize::from(b.options.fusion_scales.unwrap_or(4));
     let image_network = ResNet::detect(&b.tensors, IMAGE, Some(LIDAR));
     let lidar_network = ResNet::detect(&b.tensors, LIDAR, Some(IMAGE));
     let channels = lidar_network.lidar_channels(&b.tensors);
@@ -52,7 +51,7 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     for (scale, (image_modules, lidar_modules)) in (1..).zip(image_side.iter().zip(&lidar_side)) {
         image = image_network.stage(b, scale, image)?;
         lidar = lidar_network.stage(b, scale, lidar)?;
-        if scale < first_scale {
+        if scale + fusion_scales <= 4 {
             continue;
         }
         let from_image = image_modules.embed(b, image, grid)?;
@@ -64,8 +63,8 @@ pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
         let projection = if scale == 2 { &image_side[0] } else { image_modules };
         let to_lidar = projection.project(b, scale, from_image, bev_points)?;
         let to_image = lidar_modules.project(b, scale, from_lidar, camera_points)?;
-        image = image_modules.add_back(b, to_image, image, grid)?;
-        lidar = lidar_modules.add_back(b, to_lidar, lidar, grid)?;
+        image = image_modules.add_back(b, to_image, image)?;
+        lidar = lidar_modules.add_back(b, to_lidar, lidar)?;
     }
     let features = b.push("encoder", Op::GlobalPool, &[image, lidar])?;
     head::waypoints(b, features, 2)
@@ -150,12 +149,7 @@ impl Side {
     fn embed(&self, b: &mut Builder<'_>, map: ValueId, grid: u16) -> Result<ValueId> {
         let Self { name, scale, .. } = self;
         let features = b.push(format!("encoder.{name}_conv{scale}"), Op::Linear(self.conv.clone()), &[map])?;
-        let pixels = (b.graph.value(map).shape.height / grid) as u8;
-        if pixels == 1 {
-            return Ok(features);
-        }
-        let window = Window::square(pixels, pixels, 0);
-        b.push(format!("encoder.{name}_embedding{scale}"), Op::AveragePool(window), &[features])
+        b.pooled_to(format!("encoder.{name}_embedding{scale}"), features, (grid, grid))
     }
 
     /// Sums of embeddings by lists of cells, projected; at another scale than its own, too.
@@ -172,14 +166,11 @@ impl Side {
     }
 
     /// What the map gets, enlarged to its size, brought to its channels and added to it.
-    fn add_back(&self, b: &mut Builder<'_>, mut x: ValueId, map: ValueId, grid: u16) -> Result<ValueId> {
+    fn add_back(&self, b: &mut Builder<'_>, x: ValueId, map: ValueId) -> Result<ValueId> {
         let Self { name, scale, .. } = self;
-        let pixels = b.graph.value(map).shape.height / grid;
-        if pixels > 1 {
-            let factor = (pixels, pixels);
-            x = b.push(format!("encoder.{name}_upsample{scale}"), Op::ResizeBilinear { factor }, &[x])?;
-        }
-        x = b.push(format!("encoder.{name}_deconv{scale}"), Op::Linear(self.deconv.clone()), &[x])?;
+        let size = b.graph.value(map).shape;
+        let x = b.enlarged_to(format!("encoder.{name}_upsample{scale}"), x, (size.height, size.width))?;
+        let x = b.push(format!("encoder.{name}_deconv{scale}"), Op::Linear(self.deconv.clone()), &[x])?;
         b.push(format!("encoder.{name}_add{scale}"), Op::Add { clip: Clip::NONE }, &[x, map])
     }
 }

@@ -5,10 +5,10 @@
 
 use super::builder::Builder;
 use super::detect::{common_length, indexed_count, most_common};
+use super::has;
 use crate::error::Result;
 use crate::import::NamedTensors;
 use crate::ir::{Clip, LayerNorm, Linear, Op, Tokens, ValueId, Weights};
-use firmware::program::Window;
 use std::sync::Arc;
 
 /// As published.
@@ -26,13 +26,9 @@ fn projection(side: &str, direction: &str, scale: usize) -> String {
     format!("encoder.{side}_{direction}{scale}")
 }
 
-fn has(tensors: &NamedTensors, module: &str) -> bool {
-    tensors.under(&format!("{module}.")).next().is_some()
-}
-
 /// Whether the scales share one transformer.
 pub(super) fn is_shared(tensors: &NamedTensors) -> bool {
-    has(tensors, SHARED)
+    has(tensors, &format!("{SHARED}."))
 }
 
 /// Positional embeddings that are there.
@@ -53,6 +49,9 @@ pub(super) struct Fusions {
     grid: (u16, u16),
     /// Per scale.
     is_fused: [bool; 4],
+    /// Positional embeddings belong to all transformers or to none (the ablation without them; where it kept its unused
+    /// zeros in the checkpoint, adding them changes nothing).
+    has_position: bool,
     /// The transformer of all scales, with its width.
     shared: Option<(Transformer, usize)>,
 }
@@ -65,13 +64,15 @@ impl Fusions {
             true => projections(scale).into_iter().flatten().collect(),
             false => vec![prefix(scale)],
         };
-        let is_fused = std::array::from_fn(|s| modules(s + 1).iter().any(|module| has(&b.tensors, module)));
+        let is_fused =
+            std::array::from_fn(|s| modules(s + 1).iter().any(|module| has(&b.tensors, &format!("{module}."))));
+        let has_position = positions(&b.tensors).next().is_some();
         let shared = is_shared.then(|| {
             let attention = |name: &str| name.contains(".attn.");
             let width = common_length(&b.tensors, &[&format!("{SHARED}.blocks.")], attention).unwrap_or(widths[3]);
-            (Transformer::take(b, SHARED, width, grid), width)
+            (Transformer::take(b, SHARED, width, grid, has_position), width)
         });
-        Self { widths, grid, is_fused, shared }
+        Self { widths, grid, is_fused, has_position, shared }
     }
 
     /// Whether any scale is fused.
@@ -86,7 +87,7 @@ impl Fusions {
             return None;
         }
         let Some((transformer, width)) = &self.shared else {
-            let transformer = Transformer::take(b, &prefix(scale), channels, self.grid);
+            let transformer = Transformer::take(b, &prefix(scale), channels, self.grid, self.has_position);
             return Some(Fusion { scale, transformer, projections: None });
         };
         let projections = projections(scale).map(|[conv, deconv]| Projections {
@@ -126,15 +127,13 @@ struct Block {
 }
 
 impl Transformer {
-    /// Takes the tensors of a module. Embeddings belong to all scales or to none (the ablation without them; where it
-    /// kept its unused zeros in the checkpoint, adding them changes nothing).
-    fn take(b: &mut Builder<'_>, module: &str, channels: usize, grid: (u16, u16)) -> Self {
+    /// Takes the tensors of a module.
+    fn take(b: &mut Builder<'_>, module: &str, channels: usize, grid: (u16, u16), has_position: bool) -> Self {
         let name = |leaf: &str| format!("{module}.{leaf}");
         let blocks = name("blocks.");
         let hidden = common_length(&b.tensors, &[&blocks], |n| n.contains(".mlp.0.")).unwrap_or(4 * channels);
         let layers = indexed_count(&b.tensors, &blocks).max(1);
         let count = 2 * usize::from(grid.0) * usize::from(grid.1);
-        let has_position = positions(&b.tensors).next().is_some();
         let position = has_position.then(|| {
             let weights = b.weights(&name("pos_emb"), &[1, count, channels]);
             let data = Arc::unwrap_or_clone(weights).data;
@@ -212,7 +211,7 @@ impl Fusion {
         velocity: ValueId,
     ) -> Result<(ValueId, ValueId)> {
         let p = prefix(self.scale);
-        let Transformer { grid, embedding, blocks, norm, .. } = &self.transformer;
+        let Transformer { grid, embedding, blocks, norm } = &self.transformer;
         let (image_tokens, lidar_tokens) = (self.project(b, 0, image)?, self.project(b, 1, lidar)?);
         let tokens = Op::Tokens(embedding.clone());
         let mut stream = b.push(format!("{p}.tokens"), tokens, &[image_tokens, lidar_tokens, velocity])?;
@@ -230,14 +229,7 @@ impl Fusion {
         let Some(projections) = &self.projections else { return Ok(map) };
         let (name, conv) = (SIDES[side], projections[side].to.clone());
         let features = b.push(projection(name, "conv", self.scale), Op::Linear(conv), &[map])?;
-        let size = b.graph.value(map).shape;
-        let (height, width) = (size.height / self.transformer.grid.0, size.width / self.transformer.grid.1);
-        if (height, width) == (1, 1) {
-            return Ok(features);
-        }
-        let cell = Window { kernel_h: height as u8, kernel_w: width as u8, ..Window::square(1, 1, 0) };
-        let window = Window { stride_h: cell.kernel_h, stride_w: cell.kernel_w, ..cell };
-        b.push(format!("encoder.{name}_embedding{}", self.scale), Op::AveragePool(window), &[features])
+        b.pooled_to(format!("encoder.{name}_embedding{}", self.scale), features, self.transformer.grid)
     }
 
     /// Final LayerNorm of one map's tokens, enlarged to the map's size and added to it.
@@ -249,13 +241,10 @@ impl Fusion {
         stream: ValueId,
         map: ValueId,
     ) -> Result<ValueId> {
-        let (p, name, grid) = (prefix(self.scale), SIDES[side], self.transformer.grid);
+        let (p, name) = (prefix(self.scale), SIDES[side]);
         let mut branch = b.push(format!("{p}.ln_f.{name}"), Op::LayerNorm(norm), &[stream])?;
         let size = b.graph.value(map).shape;
-        let factor = (size.height / grid.0, size.width / grid.1);
-        if factor != (1, 1) {
-            branch = b.push(format!("{p}.upsample.{name}"), Op::ResizeBilinear { factor }, &[branch])?;
-        }
+        branch = b.enlarged_to(format!("{p}.upsample.{name}"), branch, (size.height, size.width))?;
         if let Some(projections) = &self.projections {
             let conv = Op::Linear(projections[side].back.clone());
             branch = b.push(projection(name, "deconv", self.scale), conv, &[branch])?;
