@@ -191,7 +191,12 @@ fn bad_input_is_exit_status_two_and_says_what_to_do() {
     assert_eq!(project.host_sim(&format!("attention alone.img {inputs}")).status, 0, "the last block needs no name");
     let aim = Project::new(System::Aim);
     let outcome = aim.host_sim(&format!("attention net.img {inputs}"));
-    assert!(outcome.status == 2 && outcome.err.contains("it has no attention block"), "{}", outcome.err);
+    assert!(
+        outcome.status == 2 && outcome.err.contains("net.img: the network has no attention block"),
+        "{}",
+        outcome.err
+    );
+    assert!(outcome.err.contains("help: the statistics are about fusing transformers"), "{}", outcome.err);
 }
 
 #[test]

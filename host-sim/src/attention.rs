@@ -170,8 +170,12 @@ pub fn attention(options: &Options, progress: &ProgressBar) -> Result<Measured> 
     };
     let graph = checkpoint.map(|path| files::load_graph(path, &options.import)).transpose()?;
 
-    let integer_block = image.as_ref().map(|i| IntegerBlock::find(i, record.as_ref(), &options.block)).transpose()?;
-    let float_block = graph.as_ref().map(|graph| FloatBlock::find(graph, &options.block)).transpose()?;
+    let within_model = |e: Error| e.within(options.model.display());
+    let find = |image| IntegerBlock::find(image, record.as_ref(), &options.block);
+    let integer_block = image.as_ref().map(find).transpose().map_err(within_model)?;
+    let find =
+        |(graph, path): (_, &PathBuf)| FloatBlock::find(graph, &options.block).map_err(|e| e.within(path.display()));
+    let float_block = graph.as_ref().zip(checkpoint).map(find).transpose()?;
     let block = block::common(integer_block.as_ref(), float_block.as_ref())?;
     let queries = Queries::new(&options.rows, block.grids)?;
     let top = queries::top(options.top, block.grids)?;
@@ -183,7 +187,7 @@ pub fn attention(options: &Options, progress: &ProgressBar) -> Result<Measured> 
     let frames = options.frames.load(&format)?;
 
     let mut int8 = match (image, integer_block) {
-        (Some(image), Some(block)) => Some(IntegerAttention::new(image, block, options.backend)?),
+        (Some(image), Some(block)) => Some(IntegerAttention::new(image, block, options.backend).map_err(within_model)?),
         _ => None,
     };
     let float = float_block.map(FloatAttention::new);

@@ -1,28 +1,30 @@
-//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `drive`, `score`, `bench`, `schema`, `completions`,
-//! and the demo without any of them.
+//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `drive`, `score`, `bench`, `schema`,
+//! `completions`, and the demo without any of them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
 use crate::ablation;
 use crate::backends::{Backend, BackendKind};
-use crate::diff::Diff;
 use crate::files::FrameSource;
-use crate::gates::{self, Gates};
-use crate::noise::{self, Selection};
-use crate::report::{self, VerifyReport, html, json, terminal};
-use crate::{bench, demo, drive, metrics, run, verify};
+use crate::report::{self, json, terminal};
+use crate::{demo, drive, metrics, run};
 use attention::AttentionArgs;
+use bench::BenchArgs;
 use clap::{Args, Parser, Subcommand};
+use diff::DiffArgs;
 use indicatif::ProgressBar;
-use model_compiler::artifact;
 use model_compiler::cli::{CompletionArgs, ImportArgs, progress_bar};
 use model_compiler::error::{Error, ErrorCode, Result};
-use std::collections::BTreeSet;
 use std::ffi::OsString;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use verify::VerifyArgs;
 
 mod attention;
+mod bench;
+mod diff;
 mod examples;
+mod gates;
+mod verify;
 
 pub use model_compiler::cli::Console;
 
@@ -59,36 +61,8 @@ enum Command {
     /// Compares every byte of every step with an f64 model, and every value with the f32 network.
     #[command(after_help = examples::VERIFY)]
     Verify {
-        /// Model image.
-        #[arg(value_name = "OUT.img")]
-        image: PathBuf,
-        /// The checkpoint or ONNX file that it was compiled from; without it only bytes are compared.
-        #[arg(long, value_name = "MODEL")]
-        model: Option<PathBuf>,
         #[command(flatten)]
-        import: ImportArgs,
-        #[command(flatten)]
-        frames: FrameSource,
-        #[command(flatten)]
-        backend: BackendArgs,
-        /// Build record of the image [default: OUT.record beside OUT.img].
-        #[arg(long, value_name = "FILE")]
-        record: Option<PathBuf>,
-        /// Also run the mirror image of every frame (more evaluation frames, unknown to the calibration).
-        #[arg(long)]
-        mirror: bool,
-        #[command(flatten)]
-        gates: GateArgs,
-        /// Report of an earlier verification (report.json) to compare with, step by step.
-        #[arg(long, value_name = "OLD.json")]
-        baseline: Option<PathBuf>,
-        /// Write report.html and report.json to this folder.
-        #[arg(long, value_name = "DIR")]
-        report: Option<PathBuf>,
-        /// Measure the share of each tensor in the output's noise in a large network, too: of the COUNT tensors with the
-        /// lowest local SQNR [default: 64]. In a small network all of them are measured anyway.
-        #[arg(long, value_name = "COUNT", num_args = 0..=1, require_equals = true)]
-        noise_share: Option<Option<usize>>,
+        verify: VerifyArgs,
         #[command(flatten)]
         common: Common,
     },
@@ -111,7 +85,8 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
-    /// How often tokens of one sensor attend to the other in a fusing transformer: integers, f32, and how far they agree.
+    /// How often tokens of one sensor attend to the other in a fusing transformer: integers, f32, and how far they
+    /// agree.
     #[command(after_help = examples::ATTENTION)]
     Attention {
         #[command(flatten)]
@@ -153,18 +128,8 @@ enum Command {
     /// What changed from one report of a verification to another, without running anything.
     #[command(after_help = examples::DIFF)]
     Diff {
-        /// Earlier report (report.json).
-        #[arg(value_name = "OLD.json")]
-        old: PathBuf,
-        /// Later report.
-        #[arg(value_name = "NEW.json")]
-        new: PathBuf,
-        /// Exit 1 where a step lost more.
-        #[arg(long, value_name = "DB")]
-        max_loss: Option<f64>,
-        /// Write diff.html and diff.json to this folder.
-        #[arg(long, value_name = "DIR")]
-        report: Option<PathBuf>,
+        #[command(flatten)]
+        diff: DiffArgs,
         #[command(flatten)]
         common: Common,
     },
@@ -184,9 +149,6 @@ enum Command {
     /// of its own: put `taskset -c N` in front of the command and let nothing else run there.
     #[command(after_help = examples::BENCH, verbatim_doc_comment)]
     Bench {
-        /// Model image.
-        #[arg(value_name = "OUT.img")]
-        image: PathBuf,
         #[command(flatten)]
         bench: BenchArgs,
         #[command(flatten)]
@@ -198,86 +160,10 @@ enum Command {
 }
 
 #[derive(Debug, Args)]
-struct GateArgs {
-    /// Exit 1 where a step's SQNR against the f32 network is lower.
-    #[arg(long, value_name = "DB")]
-    min_sqnr: Option<f64>,
-    /// Exit 1 where the first output's SQNR against the f32 network is lower.
-    #[arg(long, value_name = "DB")]
-    min_output_sqnr: Option<f64>,
-    /// Exit 1 where a step lost more against the baseline.
-    #[arg(long, value_name = "DB")]
-    max_loss: Option<f64>,
-    /// Exit 1 where the classes of int8 and f32 agree on fewer frames.
-    #[arg(long, value_name = "PERCENT", value_parser = percent)]
-    min_agreement: Option<f64>,
-    /// Exit 1 where the class is the label on fewer frames.
-    #[arg(long, value_name = "PERCENT", value_parser = percent)]
-    min_top1: Option<f64>,
-    /// Exit 1 where a limit of this file is missed: min_sqnr_db, min_output_sqnr_db, max_waypoint_error_mm,
-    /// max_control_error, max_point_error_px, min_agreement_percent, min_top1_percent, max_arena_bytes,
-    /// max_flash_bytes, max_loss_db, and [steps] with "PATTERN" = dB.
-    #[arg(long, value_name = "FILE.toml")]
-    gate: Option<PathBuf>,
-}
-
-/// A percentage; a share such as 0.9 would be a gate that nothing ever misses.
-fn percent(text: &str) -> std::result::Result<f64, String> {
-    let percent = text.parse::<f64>().ok().filter(|p| gates::is_percentage(*p));
-    percent.ok_or_else(|| format!("found {text:?}, expected {}", gates::PERCENTAGE))
-}
-
-impl GateArgs {
-    fn gates(&self) -> Result<Gates> {
-        let file = self.gate.as_deref().map(Gates::read).transpose()?.unwrap_or_default();
-        let arguments = Gates {
-            min_sqnr_db: self.min_sqnr,
-            min_output_sqnr_db: self.min_output_sqnr,
-            max_loss_db: self.max_loss,
-            min_agreement_percent: self.min_agreement,
-            min_top1_percent: self.min_top1,
-            ..Gates::default()
-        };
-        Ok(arguments.or(file))
-    }
-}
-
-#[derive(Debug, Args)]
 struct BackendArgs {
     /// Kernels of the engine; all give the same bytes [default: the fastest of this machine].
     #[arg(long, value_name = "NAME")]
     backend: Option<BackendKind>,
-}
-
-#[derive(Debug, Args)]
-struct BenchArgs {
-    /// Kernels to measure; may be repeated [default: all of this machine].
-    #[arg(long = "backend", value_name = "NAME")]
-    backends: Vec<BackendKind>,
-    /// Inferences per backend, and as many again for the steps [default: as many as fit into ten seconds, at least 5].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
-    rounds: Option<u32>,
-    /// Show the K slowest steps of the fastest backend.
-    #[arg(long, value_name = "K", default_value_t = 15)]
-    top: usize,
-    /// Show every step, in the order of execution.
-    #[arg(long, conflicts_with = "top")]
-    all: bool,
-}
-
-impl BenchArgs {
-    /// Each backend once, the portable one first.
-    fn choose(&self) -> Result<Vec<Backend>> {
-        if self.backends.is_empty() {
-            return Ok(Backend::all());
-        }
-        let kinds: BTreeSet<BackendKind> = self.backends.iter().copied().collect();
-        kinds.into_iter().map(|kind| Backend::choose(Some(kind))).collect()
-    }
-
-    fn top(&self) -> Option<usize> {
-        (!self.all).then_some(self.top)
-    }
 }
 
 impl BackendArgs {
@@ -376,34 +262,7 @@ impl Command {
                 console.print(&if common.json { json::run(&report).to_string() } else { terminal::run(&report) });
                 Ok(0)
             }
-            Self::Verify {
-                image,
-                model,
-                import,
-                frames,
-                backend,
-                record,
-                mirror,
-                gates,
-                baseline,
-                report,
-                noise_share,
-                common,
-            } => {
-                let noise = noise_share
-                    .map_or(Selection::WhereCheap, |count| Selection::Lowest(count.unwrap_or(noise::DEFAULT_TENSORS)));
-                let (import, backend, gates) = (import.options()?, backend.choose(&common)?, gates.gates()?);
-                let options =
-                    verify::Options { image, record, model, import, frames, backend, mirror, gates, baseline, noise };
-                let verified = verify::verify(&options, progress)?;
-                if let Some(folder) = &report {
-                    report::write(folder, &verified.report, &verified.frames)?;
-                }
-                let report = verified.report;
-                warn(&report, console);
-                console.print(&if common.json { json::verify(&report).to_string() } else { terminal::verify(&report) });
-                Ok(conclude(report.failure.as_ref(), common.json, console))
-            }
+            Self::Verify { verify, common } => verify.execute(&common, console, progress),
             Self::Ablate { model, import, calib, frames, mirror, common } => {
                 let options = ablation::Options { model, import: import.options()?, calib, frames, mirror };
                 let rows = ablation::ablate(&options, progress)?;
@@ -425,60 +284,17 @@ impl Command {
                 console.print(&if common.json { json::score(&score).to_string() } else { terminal::score(&score) });
                 Ok(0)
             }
-            Self::Diff { old, new, max_loss, report, common } => {
-                let diff = Diff::between(&json::read(&old)?, &json::read(&new)?)?;
-                compare(&diff, max_loss, report.as_deref(), common.json, console)
-            }
+            Self::Diff { diff, common } => diff.execute(&common, console),
             Self::Schema { document, .. } => {
                 console.print(&format!("{:#}", json::schema(document)));
                 Ok(0)
             }
-            Self::Bench { image, bench: args, common } => {
-                let options = bench::Options { image, backends: args.choose()?, rounds: args.rounds };
-                let report = bench::bench(&options, progress)?;
-                if let Some(reason) = &report.unnamed {
-                    console.complain(&format!("warning: steps bear the names of their operators: {reason}"));
-                }
-                let table = || terminal::bench(&report, args.top());
-                console.print(&if common.json { json::bench(&report).to_string() } else { table() });
-                Ok(0)
-            }
+            Self::Bench { bench, common } => bench.execute(&common, console, progress),
             Self::Completions(shell) => {
                 progress.finish_and_clear();
                 console.print(&shell.script::<Cli>());
                 Ok(0)
             }
-        }
-    }
-}
-
-/// Shows the changes between two reports and checks the gate on them.
-fn compare(
-    diff: &Diff,
-    max_loss: Option<f64>,
-    folder: Option<&Path>,
-    json: bool,
-    console: &mut Console<'_>,
-) -> Result<u8> {
-    let gates: Vec<_> = max_loss.map(|limit| gates::loss(diff, limit)).into_iter().collect();
-    let failure = gates::failure(&gates);
-    let document = json::diff(diff, &gates, failure.as_ref());
-    if let Some(folder) = folder {
-        std::fs::create_dir_all(folder).map_err(|e| Error::io(folder, &e))?;
-        let page = html::diff_page(diff, &gates);
-        artifact::write_files(&[
-            (&folder.join("diff.html"), page.as_bytes()),
-            (&folder.join("diff.json"), &json::bytes(&document)),
-        ])?;
-    }
-    console.print(&if json { document.to_string() } else { terminal::diff(diff) + &terminal::gates(&gates) });
-    match failure {
-        None => Ok(0),
-        Some(failure) => {
-            if !json {
-                console.complain(&format!("error: {failure}"));
-            }
-            Ok(failure.code.exit_status())
         }
     }
 }
@@ -512,15 +328,6 @@ impl Common {
     #[cfg(not(feature = "fault-injection"))]
     fn inject_fault(&self) -> Result<()> {
         Ok(())
-    }
-}
-
-/// What a reader of the figures must know first.
-fn warn(report: &VerifyReport, console: &mut Console<'_>) {
-    warn_of_calibration(&report.calibration_frames, report.frames.len(), console);
-    for frame in report.frames.iter().filter(|frame| frame.dropped_points > 0) {
-        let (name, points) = (&frame.name, frame.dropped_points);
-        console.complain(&format!("warning: frame {name}: {points} LiDAR points are not finite and were left out"));
     }
 }
 
@@ -572,7 +379,7 @@ mod tests {
     use super::*;
     use clap::CommandFactory;
 
-    fn parse(arguments: &str) -> std::result::Result<Cli, clap::Error> {
+    pub(super) fn parse(arguments: &str) -> std::result::Result<Cli, clap::Error> {
         Cli::try_parse_from(arguments.split(' '))
     }
 
@@ -613,36 +420,6 @@ mod tests {
                 Cli::try_parse_from(&words).unwrap_or_else(|e| panic!("{example}: {e}"));
                 assert!(command.get_name() == "host-sim" || words[1] == command.get_name(), "{example}");
             }
-        }
-    }
-
-    #[test]
-    fn bench_takes_each_backend_once() {
-        let choose = |arguments: &str| {
-            let cli = parse(&format!("host-sim bench a.img{arguments}")).unwrap();
-            let Some(Command::Bench { bench, .. }) = cli.command else { panic!("not bench") };
-            let kinds: Vec<BackendKind> = bench.choose().unwrap().into_iter().map(Backend::kind).collect();
-            (kinds, bench.top())
-        };
-        assert_eq!(choose(" --backend portable --backend portable --all"), (vec![BackendKind::Portable], None));
-        let every: Vec<BackendKind> = Backend::all().into_iter().map(Backend::kind).collect();
-        assert_eq!(choose(""), (every, Some(15)));
-        assert!(parse("host-sim bench a.img --top 3 --all").is_err());
-        assert!(parse("host-sim bench a.img --rounds 0").is_err());
-    }
-
-    #[test]
-    fn verify_takes_its_options() {
-        let cli = parse("host-sim verify a.img --model m.pth --frames f --mirror --min-sqnr 20.5 --record r").unwrap();
-        let Some(Command::Verify { model, record, mirror, gates, noise_share, .. }) = cli.command else {
-            panic!("not verify")
-        };
-        assert_eq!((model, record), (Some("m.pth".into()), Some("r".into())));
-        assert_eq!((mirror, gates.min_sqnr, noise_share), (true, Some(20.5), None));
-        for (option, expected) in [("--noise-share", Some(None)), ("--noise-share=9", Some(Some(9)))] {
-            let cli = parse(&format!("host-sim verify a.img --frames f {option}")).unwrap();
-            let Some(Command::Verify { noise_share, .. }) = cli.command else { panic!("not verify") };
-            assert_eq!(noise_share, expected);
         }
     }
 }

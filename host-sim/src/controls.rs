@@ -7,8 +7,9 @@ use std::borrow::Cow;
 
 /// Name of the output that holds the sigmoids of steer, throttle and brake.
 const CONTROLS: &str = "controls";
-/// Name of the output that holds the speed that the network reads off its features, m/s.
-const SPEED: &str = "predicted_speed";
+/// Name of the output that holds the speed that the network reads off its features, m/s. It is no control: neither a
+/// gate on controls nor the order of frames counts its error.
+pub const PREDICTED_SPEED: &str = "predicted_speed";
 
 /// Raw outputs of the network, before the agent's post-processing.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -40,7 +41,7 @@ pub struct ControlPrediction {
 
 impl ControlPrediction {
     /// Names of the values, in order.
-    pub const NAMES: [&str; 4] = ["steer", "throttle", "brake", "predicted_speed"];
+    pub const NAMES: [&str; 4] = ["steer", "throttle", "brake", PREDICTED_SPEED];
 
     /// The values that are there, with their names.
     pub fn values(&self) -> impl Iterator<Item = (&'static str, f64)> {
@@ -64,7 +65,7 @@ impl ControlOutputs {
         for (index, name) in names.into_iter().enumerate() {
             match name {
                 CONTROLS => controls = Some(index),
-                SPEED => speed = Some(index),
+                PREDICTED_SPEED => speed = Some(index),
                 _ => {}
             }
         }

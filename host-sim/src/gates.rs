@@ -20,6 +20,7 @@
 
 use crate::attention::{AttentionReport, FrameAttention};
 use crate::classification::ClassificationSummary;
+use crate::controls::PREDICTED_SPEED;
 use crate::diff::Diff;
 use crate::report::{MeanAndMax, StepReport, VerifyReport, worst};
 use glob::Pattern;
@@ -71,7 +72,7 @@ pub struct GateOutcome {
     pub limit: f64,
     /// The limit is a minimum; else a maximum.
     pub at_least: bool,
-    /// Unit of both.
+    /// Unit of both; empty where they have none.
     pub unit: Cow<'static, str>,
     /// The figure keeps the limit.
     pub met: bool,
@@ -103,15 +104,19 @@ impl GateOutcome {
 
     /// `found 12.30 dB, expected at least 15 dB`.
     pub fn words(&self) -> String {
-        let digits = if self.unit == "B" { 0 } else { 2 };
+        let (digits, space) = match &*self.unit {
+            "" => (4, ""),
+            "B" => (0, " "),
+            _ => (2, " "),
+        };
         let unit = &self.unit;
         let found = match self.found {
-            Some(found) if found.is_finite() => format!("{found:.digits$} {unit}"),
+            Some(found) if found.is_finite() => format!("{found:.digits$}{space}{unit}"),
             Some(found) if found.is_infinite() => "exact values".to_owned(),
             _ => "no figure".to_owned(),
         };
         let side = if self.at_least { "at least" } else { "at most" };
-        format!("found {found}, expected {side} {} {unit}", self.limit)
+        format!("found {found}, expected {side} {}{space}{unit}", self.limit)
     }
 }
 
@@ -280,7 +285,7 @@ impl Gates {
                 .map(|limit| farthest("max_waypoint_error_mm", "waypoint", &summary.waypoint_error_mm, limit, "mm")),
         );
         if let Some(limit) = self.max_control_error {
-            let controls = summary.control_error.iter().filter(|error| error.name != "predicted_speed");
+            let controls = summary.control_error.iter().filter(|error| error.name != PREDICTED_SPEED);
             let largest = controls.max_by(|a, b| a.max.total_cmp(&b.max));
             let place = largest.map(|error| error.name.clone().into_owned());
             outcomes.push(GateOutcome::at_most("max_control_error", place, largest.map(|e| e.max), limit, ""));
@@ -367,6 +372,7 @@ fn lowest(gate: &str, steps: &[StepReport], limit: f64) -> GateOutcome {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::controls::ControlError;
     use crate::report::tests::report;
 
     fn outcome(gates: Gates) -> GateOutcome {
@@ -452,6 +458,19 @@ mod tests {
         report.summary.point_error_px.clear();
         let gates = Gates { max_point_error_px: Some(9.0), ..Gates::default() };
         assert!(!gates.outcomes(&report).unwrap()[0].met, "a network without points");
+    }
+
+    #[test]
+    fn controls_have_no_unit_and_small_errors() {
+        let mut report = report();
+        let error = |name: &'static str, max| ControlError { name: name.into(), mean: 0.0, max };
+        report.summary.control_error = vec![error("steer", 0.0016), error("brake", 0.001), error(PREDICTED_SPEED, 0.5)];
+        let gates = Gates { max_control_error: Some(0.001), ..Gates::default() };
+        let missed = failure(&gates.outcomes(&report).unwrap()).unwrap();
+        assert_eq!(missed.to_string(), "gate max_control_error: steer: found 0.0016, expected at most 0.001");
+        let gates = Gates { max_arena_bytes: Some(2047), ..Gates::default() };
+        let missed = failure(&gates.outcomes(&report).unwrap()).unwrap();
+        assert_eq!(missed.to_string(), "gate max_arena_bytes: found 2048 B, expected at most 2047 B");
     }
 
     #[test]

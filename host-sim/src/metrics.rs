@@ -1,14 +1,14 @@
 //! How well a car drove: the driving score of the CARLA leaderboard, from logs of whole routes.
 //!
-//! A closed loop writes a [`RouteLog`] per route: where the route goes, where the car was, what it hit or ran over. From
-//! that alone a route gets
+//! A closed loop writes a [`RouteLog`] per route: where the route goes, where the car was, what it hit or ran over.
+//! From that alone a route gets
 //! * **route completion** RC, 0..=100 %: length of the route up to the last waypoint passed ([`progress`])
 //! * **infraction penalty** P, 0..=1: a factor per event ([`penalty`])
 //! * **driving score** `DS = max(RC·P, 0)`
 //! * an [`Ending`]: complete, or the rule that ended it ([`ending`]); what the log holds after that does not count
 //!
-//! The means of RC, P and DS over routes are plain averages: every route counts the same, however long it is, so the mean
-//! DS is not the product of the other two.
+//! The means of RC, P and DS over routes are plain averages: every route counts the same, however long it is, so the
+//! mean DS is not the product of the other two.
 
 use model_compiler::error::Result;
 use progress::Progress;

@@ -12,7 +12,7 @@ use crate::attention::Measured;
 use crate::channels::Channels;
 use crate::classification::{ClassificationSummary, ClassifiedFrame};
 use crate::compare::StepDifference;
-use crate::controls::{ControlError, ControlPrediction};
+use crate::controls::{ControlError, ControlPrediction, PREDICTED_SPEED};
 use crate::diff::Diff;
 use crate::drive::DriveReport;
 use crate::gates::GateOutcome;
@@ -262,9 +262,9 @@ impl FrameReport {
     /// How bad the frame is, for sorting: the largest error of a waypoint, control or point, else the noise of the
     /// output.
     pub fn badness(&self) -> f64 {
-        let controls = self.control_errors().into_iter().map(|(_, error)| error);
+        let controls = self.control_errors().into_iter().filter(|(name, _)| *name != PREDICTED_SPEED);
         let places = self.waypoint_error_mm.iter().chain(&self.point_error_px).copied();
-        let largest = places.chain(controls).reduce(f64::max);
+        let largest = places.chain(controls.map(|(_, error)| error)).reduce(f64::max);
         largest.or(self.output_sqnr_db.map(|db| -db)).unwrap_or(f64::NEG_INFINITY)
     }
 }
@@ -327,6 +327,7 @@ impl VerifyReport {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::controls::tests::prediction;
 
     pub(crate) fn step(position: usize, sqnr_db: Option<f64>) -> StepReport {
         StepReport {
@@ -413,6 +414,16 @@ pub(crate) mod tests {
         assert_eq!(worst(&steps).unwrap().position, 3);
         assert_eq!(worst(&[step(0, Some(3.0)), step(1, Some(f64::NAN))]).unwrap().position, 1);
         assert!(worst(&[step(0, None)]).is_none());
+    }
+
+    #[test]
+    fn the_predicted_speed_makes_no_frame_bad() {
+        let mut frame = report().frames.remove(0);
+        frame.waypoint_error_mm.clear();
+        frame.control = Some(prediction(0.5));
+        frame.reference_control = Some(ControlPrediction { predicted_speed: Some(9.0), ..prediction(0.25) });
+        assert!(frame.control_errors().contains(&(PREDICTED_SPEED, 5.0)));
+        assert_eq!(frame.badness(), 0.25);
     }
 
     #[test]

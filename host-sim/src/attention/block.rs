@@ -8,6 +8,9 @@ use model_compiler::record::Record;
 use std::convert::Infallible;
 use std::str::FromStr;
 
+/// The remedy where the network is none that this is about.
+pub(super) const FUSING_ONLY: &str = "the statistics are about fusing transformers, those of TransFuser";
+
 /// Which block.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum BlockChoice {
@@ -181,7 +184,8 @@ pub fn common(integers: Option<&IntegerBlock>, float: Option<&FloatBlock<'_>>) -
 /// One of the blocks, which stand in the order of execution.
 fn choose(mut blocks: Vec<(usize, String)>, choice: &BlockChoice) -> Result<(usize, String)> {
     if blocks.is_empty() {
-        return Err(Error::new(ErrorCode::Unsupported, "network", "it has no attention block"));
+        let error = Error::new(ErrorCode::Unsupported, "", "the network has no attention block");
+        return Err(error.with_help(FUSING_ONLY));
     }
     let is_chosen = |name: &str| match choice {
         BlockChoice::Last => true,
@@ -205,7 +209,7 @@ fn fused(name: &str, grids: Option<Grids>, tokens: u32) -> Result<Grids> {
     grids.filter(|grids| u32::from(grids.tokens()) == tokens).ok_or_else(|| {
         let message = "it does not attend over the tokens of a camera image and of a LiDAR histogram";
         let error = Error::new(ErrorCode::Unsupported, format!("attention block {name}"), message);
-        error.with_help("the statistics are about fusing transformers, those of TransFuser")
+        error.with_help(FUSING_ONLY)
     })
 }
 
@@ -236,10 +240,7 @@ mod tests {
         assert!(error.contains("no attention block is called encoder.transformer"), "{error}");
         assert!(error.contains("encoder.transformer2.blocks.10.attn.context"), "{error}");
         let error = choose(Vec::new(), &BlockChoice::Last).unwrap_err();
-        assert_eq!(
-            (error.code, error.to_string().as_str()),
-            (ErrorCode::Unsupported, "network: it has no attention block")
-        );
+        assert_eq!((error.code, error.help.as_str()), (ErrorCode::Unsupported, FUSING_ONLY));
     }
 
     #[test]

@@ -6,7 +6,7 @@
 //! engine wrote, code for code.
 
 use super::AttentionMap;
-use super::block::IntegerBlock;
+use super::block::{FUSING_ONLY, IntegerBlock};
 use crate::backends::Backend;
 use crate::codes::decode;
 use crate::run::Device;
@@ -110,7 +110,7 @@ impl<'a> IntegerAttention<'a> {
     /// Prepares an image.
     ///
     /// # Errors
-    /// The image has no output.
+    /// The image has no output, or does not hold what the step names.
     pub fn new(image: Image<'a>, block: IntegerBlock, backend: Backend) -> Result<Self> {
         let formula = Formula::of(&image, &block.step).ok_or_else(|| missing(&block))?;
         Ok(Self { image, device: Device::new(image, backend)?, block, formula })
@@ -119,8 +119,8 @@ impl<'a> IntegerAttention<'a> {
     /// The rows of a frame.
     ///
     /// # Errors
-    /// The frame lacks an input, or the engine refuses; [`ErrorCode::Check`] where the rows do not give the context that
-    /// the engine wrote.
+    /// The frame lacks an input, or the engine refuses; [`ErrorCode::Check`] where the rows do not give the context
+    /// that the engine wrote.
     pub fn map(&mut self, frame: &Frame) -> Result<AttentionMap> {
         let block = &self.block;
         let step = &block.step;
@@ -160,7 +160,8 @@ impl<'a> IntegerAttention<'a> {
 
 fn missing(block: &IntegerBlock) -> Error {
     let message = "its queries, keys or values are not written by a step of the image";
-    Error::new(ErrorCode::Unsupported, format!("attention block {}", block.block.name), message)
+    let error = Error::new(ErrorCode::Unsupported, format!("attention block {}", block.block.name), message);
+    error.with_help(FUSING_ONLY)
 }
 
 #[cfg(test)]

@@ -94,7 +94,8 @@ pub fn top(asked: Option<u16>, grids: Grids) -> Result<u16> {
         Some(top) if (1..=most).contains(&top) => Ok(top),
         Some(top) => {
             let message = format!("found {top}, expected 1 to {most}, the tokens of the sensor with the fewest");
-            Err(Error::new(ErrorCode::Usage, "--top", message))
+            let error = Error::new(ErrorCode::Usage, "--top", message);
+            Err(error.with_help(format!("leave it out for the {} strongest", TOP.min(most))))
         }
     }
 }
@@ -111,7 +112,8 @@ fn chosen(option: &str, rows: Option<&[u16]>, count: u16, [from, to]: [f64; 2]) 
         Some(&last) if last < count => Ok(sorted),
         _ => {
             let message = format!("found {rows:?}, expected rows 0 to {} of the token map", count.saturating_sub(1));
-            Err(Error::new(ErrorCode::Usage, option, message))
+            let error = Error::new(ErrorCode::Usage, option, message);
+            Err(error.with_help("leave it out for the rows of the paper"))
         }
     }
 }
@@ -158,8 +160,10 @@ mod tests {
         assert_eq!(queries.image.tokens, [0, 1, 6, 7]);
         assert_eq!(queries.lidar.tokens, [9, 11, 13, 15]);
         let wrong = QueryRows { lidar: Some(vec![2]), ..choice };
-        let error = Queries::new(&wrong, grids(4, 2)).unwrap_err().to_string();
-        assert_eq!(error, "--lidar-rows: found [2], expected rows 0 to 1 of the token map");
+        let error = Queries::new(&wrong, grids(4, 2)).unwrap_err();
+        assert_eq!(error.location, "--lidar-rows");
+        assert_eq!(error.message, "found [2], expected rows 0 to 1 of the token map");
+        assert_eq!(error.help, "leave it out for the rows of the paper");
         let none = QueryRows { image: Some(vec![]), lidar: None };
         assert!(Queries::new(&none, grids(4, 2)).is_err());
     }
@@ -169,8 +173,9 @@ mod tests {
         assert_eq!((top(None, grids(8, 8)).unwrap(), top(None, grids(2, 2)).unwrap()), (5, 4));
         assert_eq!(top(Some(12), grids(8, 8)).unwrap(), 12);
         for wrong in [0, 5] {
-            let error = top(Some(wrong), grids(2, 2)).unwrap_err().to_string();
-            assert!(error.starts_with(&format!("--top: found {wrong}, expected 1 to 4")), "{error}");
+            let error = top(Some(wrong), grids(2, 2)).unwrap_err();
+            assert!(error.message.starts_with(&format!("found {wrong}, expected 1 to 4")), "{error}");
+            assert_eq!((error.location.as_str(), error.help.as_str()), ("--top", "leave it out for the 4 strongest"));
         }
     }
 }

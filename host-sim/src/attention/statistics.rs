@@ -3,8 +3,8 @@
 //! Per frame, a query looks across where, *in any of its heads*, at least one (or all) of its strongest keys is a token
 //! of the other sensor. The percentages are over frames and queries. The heads are joined by "or" as in the script that
 //! the authors released. That script does not run as it is, and its defects are not copied:
-//! * LiDAR queries lack the offset of the image's tokens in one of its branches, so that image tokens were asked; here a
-//!   LiDAR token counts from the end of the image's
+//! * LiDAR queries lack the offset of the image's tokens in one of its branches, so that image tokens were asked; here
+//!   a LiDAR token counts from the end of the image's
 //! * of equal weights it takes whichever a partial sort leaves in front; here the lowest token wins, and
 //!   [`Statistics::tied_percent`] says how often that decides
 //! * its frames are the first files of a folder; here they are the frames that were given

@@ -1,6 +1,7 @@
 //! The `attention` command.
 
-use super::{BackendArgs, Common, conclude, percent, warn_of_calibration};
+use super::gates::percent;
+use super::{BackendArgs, Common, conclude, warn_of_calibration};
 use crate::attention::block::BlockChoice;
 use crate::attention::queries::QueryRows;
 use crate::attention::{Options, attention};

@@ -63,9 +63,9 @@ impl Rules {
         Self { length_m, start_s: None, off_route_m: 0.0, standing_since_s: None }
     }
 
-    /// The rule that ends the route at this state, if one does; states come in order. `step_m` is the way from the state
-    /// before, `distance_m` the distance from the route, `complete` whether the end is reached, which comes before all
-    /// rules.
+    /// The rule that ends the route at this state, if one does; states come in order. `step_m` is the way from the
+    /// state before, `distance_m` the distance from the route, `complete` whether the end is reached, which comes
+    /// before all rules.
     pub fn ending(&mut self, state: &EgoState, step_m: f64, distance_m: f64, complete: bool) -> Option<Ending> {
         let start_s = *self.start_s.get_or_insert(state.time_s);
         if distance_m > OFF_ROUTE_M {

@@ -6,6 +6,9 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
+/// The remedy for a log that is none.
+const FORMAT: &str = "`host-sim schema route-log` prints the format";
+
 /// One drive along one route. Positions are in one fixed frame of the map, in meters.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
@@ -75,7 +78,7 @@ impl RouteLog {
         let log: Self = serde_json::from_slice(&bytes).map_err(|e| {
             let error =
                 Error::new(ErrorCode::Malformed, path.display().to_string(), format!("this is no route log: {e}"));
-            error.with_help("`host-sim schema route-log` prints the format")
+            error.with_help(FORMAT)
         })?;
         log.check().map_err(|e| e.within(path.display()))?;
         Ok(log)
@@ -87,7 +90,8 @@ impl RouteLog {
     /// [`ErrorCode::Malformed`] with the field: another version, a route without length, no state, a number that is not
     /// finite, time that does not grow, an event outside the time of the drive.
     pub fn check(&self) -> Result<()> {
-        let refuse = |place: String, message: String| Err(Error::new(ErrorCode::Malformed, place, message));
+        let refuse =
+            |place: String, message: String| Err(Error::new(ErrorCode::Malformed, place, message).with_help(FORMAT));
         if self.schema != SCHEMA {
             return refuse("schema".into(), format!("found version {}, expected {SCHEMA}", self.schema));
         }
@@ -97,7 +101,7 @@ impl RouteLog {
             }
         }
         if self.waypoints.windows(2).all(|pair| pair[0] == pair[1]) {
-            let message = format!("the route has no length: it has {} waypoints at one place", self.waypoints.len());
+            let message = format!("found {} waypoints, expected two at different places", self.waypoints.len());
             return refuse("waypoints".into(), message);
         }
         for (index, state) in self.ego.iter().enumerate() {

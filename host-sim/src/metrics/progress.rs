@@ -1,7 +1,7 @@
 //! How far the car got along its route, and how far off it was.
 
-/// Waypoints ahead that may be passed at once: one that is off the line (a change of lanes) holds nobody up, and a route
-/// that comes back near itself is not cut short.
+/// Waypoints ahead that may be passed at once: one that is off the line (a change of lanes) holds nobody up, and a
+/// route that comes back near itself is not cut short.
 const WINDOW: usize = 2;
 /// A route is complete beyond this part of its length, percent, …
 const COMPLETE_PERCENT: f64 = 99.0;

@@ -171,8 +171,8 @@ fn bad_logs_are_refused_with_the_field() {
     type Damage = fn(&mut RouteLog);
     let cases: [(&str, Damage); 9] = [
         ("schema: found version 2, expected 1", |log| log.schema = 2),
-        ("waypoints: the route has no length: it has 0", |log| log.waypoints.clear()),
-        ("waypoints: the route has no length: it has 3", |log| log.waypoints = vec![[1.0, 2.0]; 3]),
+        ("waypoints: found 0 waypoints, expected two at different places", |log| log.waypoints.clear()),
+        ("waypoints: found 3 waypoints, expected two at different places", |log| log.waypoints = vec![[1.0, 2.0]; 3]),
         ("waypoints[4]: its coordinates are not finite", |log| log.waypoints[4][1] = f64::NAN),
         ("ego: the log holds no state", |log| log.ego.clear()),
         ("ego[1]: its time, position or speed", |log| log.ego[1].speed_mps = f64::INFINITY),
@@ -190,6 +190,7 @@ fn bad_logs_are_refused_with_the_field() {
         let error = log.check().unwrap_err();
         assert!(error.to_string().starts_with(expected), "{error}");
         assert_eq!(error.code, ErrorCode::Malformed);
+        assert_eq!(error.help, "`host-sim schema route-log` prints the format");
     }
 }
 
@@ -199,7 +200,8 @@ fn logs_come_from_files_and_errors_name_them() {
     let path = |name: &str| folder.path().join(name);
     fs::write(path("a.json"), serde_json::to_vec(&drive(500)).unwrap()).unwrap();
     let text = r#"{"schema": 1, "route": "b", "waypoints": [[0, 0], [0, 10]],
-        "ego": [{"time_s": 0, "position_m": [0, 0], "speed_mps": 5}, {"time_s": 2, "position_m": [0, 10.5], "speed_mps": 5}],
+        "ego": [{"time_s": 0, "position_m": [0, 0], "speed_mps": 5},
+                {"time_s": 2, "position_m": [0, 10.5], "speed_mps": 5}],
         "events": [{"time_s": 1, "kind": "stop_sign"}]}"#;
     fs::write(path("b.json"), text).unwrap();
     let score = score(&[path("a.json"), path("b.json")]).unwrap();

@@ -25,8 +25,8 @@ pub(super) fn summary(report: &AttentionReport) -> Markup {
             h1 { (name) " " span.for { "at " (report.block) } }
             p.meta {
                 @for (label, network) in &networks {
-                    (label) " sha256 " code title=(network.model.sha256) { (network.model.sha256.get(..16).unwrap_or("")) "…" }
-                    " · "
+                    @let sha256 = &network.model.sha256;
+                    (label) " sha256 " code title=(sha256) { (sha256.get(..16).unwrap_or("")) "…" } " · "
                 }
                 (report.heads) " heads · " (report.frames.len()) " frames"
             }

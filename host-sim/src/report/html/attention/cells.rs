@@ -31,8 +31,8 @@ pub(in crate::report::html) fn section(report: &AttentionReport, frames: &[Frame
     drawn.sort_by(|a, b| keys_percent(a.0).total_cmp(&keys_percent(b.0)));
     let compared = report.agreement.is_some();
     let about = html! {
-        "The strongest keys of one query, over all heads: camera image above, LiDAR histogram from above below it, forward "
-        "is up. Dotted cells are the queries that are counted; choose one by a click or from the list."
+        "The strongest keys of one query, over all heads: camera image above, LiDAR histogram from above below it, "
+        "forward is up. Dotted cells are the queries that are counted; choose one by a click or from the list."
         @if drawn.len() > SHOWN { " Drawn are " (SHOWN) " of " (drawn.len()) " frames." }
         @if compared { " The frames on which integers and f32 agree least come first." }
     };
