@@ -10,10 +10,8 @@ use model_compiler::pipeline;
 use model_compiler::quantize::QuantizeOptions;
 use model_compiler::target::Target;
 use tests::boards::{ALL, Run};
-use tests::golden::Network;
+use tests::golden::{Lbc, Network};
 use tests::{build, bundle};
-
-const SYSTEMS: [System; 3] = [System::Aim, System::LateFusion, System::TransFuser];
 
 /// The bundled network, compiled for a microcontroller.
 fn bundled() -> Vec<u8> {
@@ -48,8 +46,12 @@ fn every_board_gives_the_known_answer_of_the_bundled_network() {
 
 #[test]
 fn every_system_gives_its_known_answer_on_the_cortex_m4() {
-    for system in SYSTEMS {
-        let model = build::quantized(&build::small(&Network::small(system)), &QuantizeOptions::default());
+    for system in System::ALL {
+        let graph = match system {
+            System::Lbc => build::lbc(&Lbc::small(), false),
+            _ => build::small(&Network::small(system)),
+        };
+        let model = build::quantized(&graph, &QuantizeOptions::default());
         let image = build::compiled_for(&model, "cortex-m4").image;
         let Some(run) = ALL[0].run(&image) else { return };
         assert_eq!(run.status, Some(0), "{}:\n{}", system.name(), run.console);

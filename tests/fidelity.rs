@@ -1,5 +1,5 @@
-//! How close the integers come to f32: full-size networks, calibrated on the stored frames, evaluated on these and their
-//! mirror images.
+//! How close the integers come to f32: full-size networks, calibrated on the stored frames, evaluated on these and
+//! their mirror images.
 
 use host_sim::ablation::{Bench, Fidelity, Variant, variants};
 use model_compiler::frames::Frame;
@@ -44,8 +44,8 @@ fn global_vector_of_transfuser_reaches_20_db_with_narrow_and_28_db_with_wide_ski
 }
 
 #[test]
-fn global_vector_of_geometric_fusion_reaches_10_db_with_narrow_and_10_db_with_wide_skip_streams() {
+fn global_vector_of_geometric_fusion_reaches_19_db_with_narrow_and_21_db_with_wide_skip_streams() {
     let reached = reached(System::GeometricFusion);
-    assert!(reached[0] >= 10.0, "8-bit maps: {reached:?}");
-    assert!(reached[1] >= 10.0, "16-bit skip streams: {reached:?}");
+    assert!(reached[0] >= 19.0, "8-bit maps: {reached:?}");
+    assert!(reached[1] >= 21.0, "16-bit skip streams: {reached:?}");
 }

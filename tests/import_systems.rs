@@ -455,11 +455,11 @@ fn all_wrong_tensors_are_listed_at_once() {
     assert_eq!(error.code, ErrorCode::Tensors);
     let expected = "\
 model.pth: 9 tensors do not fit the system transfuser:
-  encoder.image_encoder.features.bn1.running_var            negative variance at index 2  expected [8]
   encoder.transformer1.pos_emb                              inf at index 3                expected [1, 8, 8]
+  encoder.transformer3.blocks.1.attn.query.weight           missing                       expected [24, 24]
+  encoder.image_encoder.features.bn1.running_var            negative variance at index 2  expected [8]
   encoder.image_encoder.features.layer2.0.bn1.running_mean  missing                       expected [16]
   encoder.lidar_encoder._model.layer3.0.conv2.weight        found [24, 24, 1, 1]          expected [24, 24, 3, 3]
-  encoder.transformer3.blocks.1.attn.query.weight           missing                       expected [24, 24]
   join.2.bias                                               found [17]                    expected [16]
   decoder.weight_hh                                         NaN at index 7                expected [48, 16]
   output.bias                                               found integers [2]            expected [2]

@@ -507,8 +507,8 @@ pub struct Softmax {
 
 /// Sums of gathered cells: `y_ijc = clamp(z_o + R(Σ_k (q[p_ijk]_c − z)·M, n))`.
 ///
-/// `p_ijk` is the cell (row `indices[i,j,2k]`, column `indices[i,j,2k+1]`) of the map, k = 0 .. K; an index outside the map
-/// means the nearest row or column. A cell may occur several times.
+/// `p_ijk` is the cell (row `indices[i,j,2k]`, column `indices[i,j,2k+1]`) of the map, k = 0 .. K; an index outside the
+/// map means the nearest row or column. A cell may occur several times.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct GatherSum {
     /// i8 or i16 map `H×W×C`.

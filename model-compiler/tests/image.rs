@@ -304,7 +304,7 @@ fn engine_refuses_wrong_use() {
     let mut slices: Vec<&[u8]> = given.iter().map(Vec::as_slice).collect();
     assert_eq!(engine.step(), Err(EngineError::NotStarted));
     assert_eq!(engine.output(0), Err(EngineError::NotDone));
-    assert_eq!(engine.start(&slices[..3]), Err(EngineError::InputCount { found: 3, expected: 5 }));
+    assert_eq!(engine.start(&slices[..3]), Err(EngineError::InputCount { found: 3, expected: 6 }));
     slices[2] = &[0; 3];
     assert_eq!(engine.start(&slices), Err(EngineError::InputBytes { input: 2, found: 3, expected: 2 }));
     assert_eq!(engine.step(), Err(EngineError::NotStarted));

@@ -86,7 +86,7 @@ fn header_changes() -> Vec<(Check, Change)> {
         (Check::HeaderReserved, Sealed(|b| b[header::RESERVED_B.end - 1] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::REGIONS.end - 1] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::SECTIONS.end - 1] = 1)),
-        (Check::Features, Sealed(|b| b[header::FEATURES.start + 1] |= 0x80)),
+        (Check::Features, Sealed(|b| b[header::FEATURES.start + 2] |= 8)),
         (Check::Features, Sealed(|b| b[header::FEATURES.start + 4] |= 4)),
         (Check::Features, Sealed(|b| b[header::FEATURES.end - 1] |= 0x80)),
         (Check::StepCount, Sealed(|b| b[header::STEP_COUNT].fill(0))),
@@ -442,7 +442,7 @@ fn operator_changes() -> Vec<(Check, Change)> {
         ),
         (
             Check::StepElement,
-            Parts(|p| step!(p, at::SPATIAL_SOFTMAX, SpatialSoftmax, |s| s.input = TensorId(ids::SUM))),
+            Parts(|p| step!(p, at::SPATIAL_SOFTMAX, SpatialSoftmax, |s| s.input = TensorId(ids::WAYPOINTS))),
         ),
         (Check::StepShape, Parts(|p| record(p, ids::POINTS).shape = Shape::tokens(4, 4))),
         (Check::StepPixels, Parts(|p| *p = spatial_softmax_alone(Shape::map(1, 257, 2)))),

@@ -154,8 +154,8 @@ pub struct Frame {
 }
 
 impl Frame {
-    /// The frame's first rows and columns of the lower center, for a network of smaller input size; of the lists of cells
-    /// the first, with numbers that the smaller map has.
+    /// The frame's first rows and columns of the lower center, for a network of smaller input size; of the lists of
+    /// cells the first, with numbers that the smaller map has.
     ///
     /// # Panics
     /// The size exceeds the stored one.

@@ -7,12 +7,13 @@
 //!   height; if that is inside the centered crop, in the image cell (column `u`, row `v`)
 //!
 //! The networks were trained with exactly this: the area is not the histogram's, and `x` counts to the left in the
-//! histogram but to the right in the image. `bev_points[bx][by]` lists image cells as `(u, v)` and `camera_points[u][v]`
-//! LiDAR cells as `(bx, by)`; the network takes each pair, and the place in the list, for a row and a column.
+//! histogram but to the right in the image. `bev_points[bx][by]` lists image cells as `(u, v)` and
+//! `camera_points[u][v]` LiDAR cells as `(bx, by)`; the network takes each pair, and the place in the list, for a row
+//! and a column.
 //!
-//! A list has room for K cells (5). The original draws K of more at random without a seed; here the first K in the order
-//! of the points are taken, which is one of its draws. A shorter list is filled up with the cell (0, 0), which the
-//! network sums like any other.
+//! A list has room for K cells (5). The original draws K of more at random without a seed; here the first K in the
+//! order of the points are taken, which is one of its draws. A shorter list is filled up with the cell (0, 0), which
+//! the network sums like any other.
 
 use super::ByteMap;
 use super::bev::Point;
@@ -43,7 +44,7 @@ pub struct Correspondence {
 /// Whether there are lists of this shape: square maps of which the image is a part, pairs.
 pub fn is_possible(shape: Shape) -> bool {
     let fits = (1..=IMAGE[1] as u16 / CELL as u16).contains(&shape.height);
-    fits && shape.height == shape.width && shape.channels > 0 && shape.channels % 2 == 0
+    fits && shape.height == shape.width && shape.channels > 0 && shape.channels.is_multiple_of(2)
 }
 
 /// The lists of all points; those that are not finite lie outside.
@@ -105,8 +106,9 @@ impl Lists {
 
 /// The lists of the mirrored scene, `x` for `−x`: first indices count from the other side, in lists and in places.
 ///
-/// Exact but for points on the very edge of a cell. A list is filled up with (0, 0), so this pair stays; of 8×8 cells no
-/// point ever gives it: image points lie below the horizon (`v ≥ 4`), and the near corner of the area is out of sight.
+/// Exact but for points on the very edge of a cell. A list is filled up with (0, 0), so this pair stays; of 8×8 cells
+/// no point ever gives it: image points lie below the horizon (`v ≥ 4`), and the near corner of the area is out of
+/// sight.
 pub(super) fn mirrored(lists: &ByteMap) -> ByteMap {
     let last = (lists.shape.height - 1) as u8;
     let mut mirrored = super::flip_rows(lists);

@@ -340,7 +340,7 @@ mod tests {
 
     #[test]
     fn the_views_of_lbc_are_joined_with_the_heatmap_of_the_goal() {
-        let root = directory(r#"{"goal": [0, 46.5]}"#);
+        let root = directory(r#"{"goal": [0, 1]}"#);
         let folder = root.path().join("one");
         let save = |file: &str, level: u8| {
             image::RgbImage::from_pixel(4, 4, image::Rgb([level; 3])).save(folder.join(file)).unwrap();
@@ -352,7 +352,7 @@ mod tests {
         save(VIEWS[2], 70);
         let frame = load(root.path(), &lbc(10)).unwrap().remove(0);
         let views = frame.views.as_ref().unwrap();
-        // The second row of four; the target is beyond the last pixel.
+        // The second row of four; the target is below and to the right of the last pixel.
         assert_eq!(views.data[..9], [0.0, 1.0, 9.0, 50.0, 50.0, 50.0, 70.0, 70.0, 70.0]);
         assert_eq!(views.data[79], 255.0);
         assert_eq!((frame.rgb.is_none(), frame.raw(InputKind::Views).unwrap().len()), (true, 80));

@@ -18,7 +18,7 @@ pub(super) fn gather_sum(
     expect("output channels", out_shape.channels.into(), shape.channels.into())?;
     expect("rows of indices", index_shape.height.into(), out_shape.height.into())?;
     expect("columns of indices", index_shape.width.into(), out_shape.width.into())?;
-    if index_shape.channels % 2 != 0 {
+    if !index_shape.channels.is_multiple_of(2) {
         let message = format!("{} channels of indices, expected pairs", index_shape.channels);
         return Err(Error::new(ErrorCode::Malformed, "", message));
     }

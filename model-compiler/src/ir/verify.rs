@@ -363,7 +363,7 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
         Op::GatherSum => {
             arity(op, inputs, 2..=2)?;
             let indices = inputs[1];
-            if indices.channels % 2 != 0 {
+            if !indices.channels.is_multiple_of(2) {
                 return Err(format!("{} channels of indices are no pairs of row and column", indices.channels));
             }
             Ok(Shape { channels: inputs[0].channels, ..indices })

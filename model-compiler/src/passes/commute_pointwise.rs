@@ -1,5 +1,5 @@
-//! A 1×1 convolution or linear layer changes places with the average pool behind it or the bilinear enlargement in front
-//! of it, so that it runs on the smaller map.
+//! A 1×1 convolution or linear layer changes places with the average pool behind it or the bilinear enlargement in
+//! front of it, so that it runs on the smaller map.
 //!
 //! Both are means whose weights sum to one, the same for every channel: what a layer of one position makes of a mean is
 //! the mean of what it makes, its bias included. Exact in real arithmetic.
@@ -25,8 +25,8 @@ pub(super) fn run(graph: &mut Graph) {
     }
 }
 
-/// The shape between two operators after they changed places, if that is cheaper; `shapes` are those before, between and
-/// behind them now. What counts are products, and values that are averaged.
+/// The shape between two operators after they changed places, if that is cheaper; `shapes` are those before, between
+/// and behind them now. What counts are products, and values that are averaged.
 fn exchanged(front: &Op, behind: &Op, [input, between, output]: [Shape; 3]) -> Option<Shape> {
     let (now, then, shape) = match (pointwise(front), behind) {
         (Some(weights), Op::AveragePool(window)) => {
@@ -170,7 +170,7 @@ mod tests {
             let between = with_bias(&mut graph, rgb, 5);
             change(&mut graph, between);
             let input = graph.value(rgb).shape;
-            if let Some(shape) = graph.nodes[1].op.output_shape(&[input]).ok() {
+            if let Ok(shape) = graph.nodes[1].op.output_shape(&[input]) {
                 graph.values[between.0 as usize].shape = shape;
             }
             let pooled = graph.push("pool", Op::AveragePool(Window::square(2, 2, 0)), &[between]).unwrap();

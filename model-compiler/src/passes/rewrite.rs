@@ -42,8 +42,8 @@ pub(super) fn own_producer(graph: &Graph, reader: usize) -> Option<usize> {
     (reads.count() == 1).then_some(producer)
 }
 
-/// A node and its [`own_producer`], with one operand each, change places. The value between them gets the shape `between`
-/// and, since it is no longer what its name said, `.input` behind its name.
+/// A node and its [`own_producer`], with one operand each, change places. The value between them gets the shape
+/// `between` and, since it is no longer what its name said, `.input` behind its name.
 pub(super) fn exchange(graph: &mut Graph, producer: usize, reader: usize, between: Shape) {
     let value = &mut graph.values[graph.nodes[producer].output.0 as usize];
     value.shape = between;

@@ -273,8 +273,8 @@ fn stages(graph: &Graph) -> Vec<u8> {
     stages
 }
 
-/// How many times larger than seen a value may become: where sums of cells come from the calibration frames' cells, others
-/// may sum up to more, and the layers behind them follow. 16 bits have room for it.
+/// How many times larger than seen a value may become: where sums of cells come from the calibration frames' cells,
+/// others may sum up to more, and the layers behind them follow. 16 bits have room for it.
 fn headroom(graph: &Graph, statistics: &Statistics) -> Vec<f64> {
     let mut headroom = vec![1.0; graph.values.len()];
     for node in &graph.nodes {

@@ -2,8 +2,8 @@
 
 use crate::ir::Shape;
 
-/// `[map, indices]`: `out[i,j] = Σ_k map[row, column]` over the pairs of each position, summed in f64. Indices are rounded
-/// and clamped to the map.
+/// `[map, indices]`: `out[i,j] = Σ_k map[row, column]` over the pairs of each position, summed in f64. Indices are
+/// rounded and clamped to the map.
 pub(super) fn gather_sum(shape: Shape, inputs: &[&[f32]], output: Shape) -> Vec<f32> {
     let (map, indices) = (inputs[0], inputs[1]);
     let (width, channels) = (usize::from(shape.width), usize::from(shape.channels));

@@ -7,7 +7,6 @@ use board_support::counter::SystemCounter;
 use board_support::image_memory;
 use board_support::uart::CmsdkUart;
 use board_support::{Machine, program, semihosting};
-use core::panic::PanicInfo;
 use core::slice;
 use cortex_m_rt::entry;
 use firmware::kernels::Portable;
@@ -30,9 +29,4 @@ fn main() -> ! {
     let (image, arena) =
         unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
     semihosting::exit(program::self_test::run(&mut machine, image, Portable, arena))
-}
-
-#[panic_handler]
-fn panic(_: &PanicInfo<'_>) -> ! {
-    semihosting::exit(101)
 }

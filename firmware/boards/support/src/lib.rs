@@ -7,9 +7,20 @@
 pub mod counter;
 pub mod image_memory;
 pub mod machine;
+pub mod mps2;
 pub mod program;
 pub mod register;
 pub mod semihosting;
 pub mod uart;
 
 pub use machine::Machine;
+
+use core::panic::PanicInfo;
+
+/// Status of a run that panicked.
+const PANICKED: u8 = 101;
+
+#[panic_handler]
+fn panic(_: &PanicInfo<'_>) -> ! {
+    semihosting::exit(PANICKED)
+}

@@ -8,7 +8,6 @@ use board_support::image_memory;
 use board_support::uart::Pl011;
 use board_support::{Machine, program, semihosting};
 use core::arch::{asm, global_asm};
-use core::panic::PanicInfo;
 use core::slice;
 use firmware::kernels::Portable;
 
@@ -66,9 +65,4 @@ extern "C" fn main() -> ! {
     let (image, arena) =
         unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
     semihosting::exit(program::self_test::run(&mut machine, image, Portable, arena))
-}
-
-#[panic_handler]
-fn panic(_: &PanicInfo<'_>) -> ! {
-    semihosting::exit(101)
 }

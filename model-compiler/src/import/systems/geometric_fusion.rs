@@ -2,9 +2,9 @@
 //! see the same points.
 //!
 //! Trained weights depend on the published network's peculiarities, which are kept: scale 2 projects image features by
-//! `image_projection1`; scale 4 gathers LiDAR features of scale 3; lists and their places are columns before rows, taken
-//! for rows before columns. So a checkpoint holds modules that nothing uses (`image_projection2`, `lidar_conv4`, those of
-//! scales that are not fused).
+//! `image_projection1`; scale 4 gathers LiDAR features of scale 3; lists and their places are columns before rows,
+//! taken for rows before columns. So a checkpoint holds modules that nothing uses (`image_projection2`, `lidar_conv4`,
+//! those of scales that are not fused).
 
 use super::builder::Builder;
 use super::detect::{common_length, indexed_count};
@@ -28,8 +28,8 @@ pub(super) fn recognize(tensors: &NamedTensors) -> bool {
     has(tensors, "encoder.image_conv") || has(tensors, "encoder.image_projection")
 }
 
-/// The last stages are fused, as many as the options say. Where that is the last alone, there is no embedding of scale 3
-/// and scale 4 gathers its own.
+/// The last stages are fused, as many as the options say. Where that is the last alone, there is no embedding of scale
+/// 3 and scale 4 gathers its own.
 pub(super) fn build(b: &mut Builder<'_>) -> Result<()> {
     let resolution = b.options.resolution.unwrap_or(DEFAULT_RESOLUTION);
     let grid = grid(resolution)?;
