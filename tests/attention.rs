@@ -205,7 +205,8 @@ fn documents_follow_their_schemas() {
     let schema =
         |name: &str| -> Value { serde_json::from_str(&project.host_sim(&format!("schema {name}")).out).unwrap() };
     for (name, fields) in [
-        ("attention", &["agreement", "frames", "queries"][..]),
+        ("run", &["model", "frames"][..]),
+        ("attention", &["agreement", "frames", "queries"]),
         ("score", &["mean", "routes"]),
         ("route-log", &["ego", "events", "waypoints"]),
     ] {

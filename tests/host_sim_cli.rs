@@ -4,6 +4,8 @@ use model_compiler::artifact;
 use model_compiler::import::System;
 use model_compiler::pipeline::{self, Compiled};
 use serde_json::Value;
+use tests::agent::{Agent, Rules};
+use tests::golden;
 use tests::project::Project;
 
 fn waypoints(document: &Value, frame: usize, field: &str) -> Vec<f64> {
@@ -24,6 +26,15 @@ fn run_gives_waypoints_of_an_image_and_of_its_checkpoint() {
     assert_eq!(int8["frames"].as_array().unwrap().len(), float["frames"].as_array().unwrap().len());
     for frame in 0..2 {
         assert_eq!(int8["frames"][frame]["name"], format!("inputs#{frame}"));
+        for document in [&int8, &float] {
+            let points = waypoints(document, frame, "waypoints");
+            let speed = f64::from(golden::frames()[frame].velocity);
+            let expected = Agent::new(Rules::BASELINES).step([0, 2].map(|k| [points[k], points[k + 1]]), speed);
+            let expected = [expected.steer, expected.throttle, f64::from(u8::from(expected.brake))];
+            let found = ["steer", "throttle", "brake"].map(|name| &document["frames"][frame]["controls"][name]);
+            let close = |(f, e): (&Value, f64)| (f.as_f64().unwrap() - e).abs() < 1e-4;
+            assert!(found.into_iter().zip(expected).all(close), "{found:?} instead of {expected:?}");
+        }
         let (int8, float) = (waypoints(&int8, frame, "waypoints"), waypoints(&float, frame, "waypoints"));
         assert_eq!(int8.len(), 8);
         let largest = float.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
@@ -32,7 +43,9 @@ fn run_gives_waypoints_of_an_image_and_of_its_checkpoint() {
         }
     }
     let table = project.host_sim("run net.img --inputs inputs.safetensors");
-    assert!(table.out.contains("forward 4") && table.out.contains("inputs#0"), "{}", table.out);
+    for part in ["forward 4", "steer", "throttle", "brake", "inputs#0"] {
+        assert!(table.out.contains(part), "{part}: {}", table.out);
+    }
     assert_eq!(table.err, "");
 }
 

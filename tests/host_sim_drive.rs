@@ -2,22 +2,44 @@
 
 use model_compiler::import::System;
 use serde_json::{Value, json};
-use tests::agent::{Agent, Rules};
-use tests::commands::Folder;
+use tests::agent::{Agent, Decision, Rules, ground};
+use tests::build;
+use tests::commands::{Folder, views_file};
 use tests::drive_log::Recording;
-use tests::golden::Network;
+use tests::golden::{self, Lbc, Network};
 
 const STEPS: usize = 16;
+/// Files of the cameras; all systems but LBC have only the first.
+const CAMERAS: [&str; 3] = ["rgb.png", "rgb_left.png", "rgb_right.png"];
+/// Height and width of LBC's views: a firmware draws its goal on no others.
+const LBC_SIZE: (u16, u16) = (144, 256);
+/// Draws the first points of LBC's small network away from the middle of the image, below the horizon.
+const SHARP: &str = " --temperature 0.1";
 
 /// A compiled small network (`net.safetensors`, `net.img`) and a log (`log`) whose images are larger than its input.
 fn project(system: System, change: impl Fn(usize, &mut Value)) -> Folder {
-    let network = Network::small(system);
-    let folder = Folder::of(&network);
-    folder.ok("model-compiler compile @net.safetensors --calib @inputs.safetensors -o @net.img");
-    // Of TransFuser the checkpoint tells the size, of the others it is 256×256.
-    let (height, width) = if system == System::TransFuser { network.resolution() } else { (256, 256) };
+    let (folder, (height, width)) = match system {
+        System::Lbc => (lbc(), LBC_SIZE),
+        // Of TransFuser the checkpoint tells the size, of the others it is 256×256.
+        _ => {
+            let network = Network::small(system);
+            (Folder::of(&network), if system == System::TransFuser { network.resolution() } else { (256, 256) })
+        }
+    };
+    let options = if system == System::Lbc { SHARP } else { "" };
+    folder.ok(&format!("model-compiler compile @net.safetensors{options} --calib @inputs.safetensors -o @net.img"));
     let image = (u32::from(width) + 14, u32::from(height) + 6);
-    Recording { image, steps: STEPS, seed: 1 }.write(&folder, "log", change);
+    let cameras = if system == System::Lbc { &CAMERAS[..] } else { &CAMERAS[..1] };
+    Recording { image, cameras, steps: STEPS, seed: 1 }.write(&folder, "log", change);
+    folder
+}
+
+/// A folder with a small network of LBC and its inputs.
+fn lbc() -> Folder {
+    let folder = Folder::default();
+    let network = Lbc { resolution: LBC_SIZE, maps: 4, ..Lbc::small() };
+    golden::write_safetensors(&network.tensors(), &folder.path("net.safetensors")).expect("a writable folder");
+    folder.write("inputs.safetensors", views_file(&build::views(LBC_SIZE)));
     folder
 }
 
@@ -39,6 +61,16 @@ fn pair(value: &Value) -> [f64; 2] {
     [number(&value[0]), number(&value[1])]
 }
 
+fn controls(value: &Value) -> [f64; 3] {
+    ["steer", "throttle", "brake"].map(|name| number(&value[name]))
+}
+
+fn assert_follows(decision: &Value, expected: Decision) {
+    let expected = [expected.steer, expected.throttle, f64::from(u8::from(expected.brake))];
+    let close = controls(decision).into_iter().zip(expected).all(|(f, e)| (f - e).abs() < 1e-4);
+    assert!(close, "{decision} instead of {expected:?}");
+}
+
 #[test]
 fn controls_follow_from_the_waypoints_of_each_network() {
     let folder = project(System::TransFuser, |_, _| ());
@@ -57,11 +89,7 @@ fn controls_follow_from_the_waypoints_of_each_network() {
                 points = [0, 1].map(|k| pair(&decision["waypoints"][k]));
             }
             if index > 0 {
-                let expected = agent.step(points, number(&step["speed_mps"]));
-                let found = ["steer", "throttle", "brake"].map(|name| number(&decision[name]));
-                let expected = [expected.steer, expected.throttle, f64::from(u8::from(expected.brake))];
-                let close = found.iter().zip(expected).all(|(f, e)| (f - e).abs() < 1e-4);
-                assert!(close, "{network}, step {index}: {found:?} instead of {expected:?}");
+                assert_follows(decision, agent.step(points, number(&step["speed_mps"])));
             }
         }
     }
@@ -74,28 +102,103 @@ fn controls_follow_from_the_waypoints_of_each_network() {
     assert!(mean > 0.0, "int8 and f32 are never equal");
 }
 
+/// Puts the frames of those steps in which the network ran into a frame directory, and gives each step with what
+/// `host-sim run` says of its frame.
+fn run_frames<'d>(folder: &Folder, document: &'d Value) -> Vec<(&'d Value, Value)> {
+    let ran: Vec<&Value> = steps(document).iter().filter(|step| step["goal_m"].is_array()).collect();
+    for step in &ran {
+        let name = step["name"].as_str().expect("a name");
+        for file in CAMERAS.into_iter().chain(["lidar.bin"]) {
+            if folder.path(&format!("log/frames/{name}/{file}")).exists() {
+                folder.write(&format!("frames/{name}/{file}"), folder.read(&format!("log/frames/{name}/{file}")));
+            }
+        }
+        let description = json!({"speed": step["speed_mps"], "goal": step["goal_m"], "command": step["command"]});
+        folder.write(&format!("frames/{name}/frame.json"), description.to_string());
+    }
+    let (status, run) = folder.json("host-sim run @net.img --frames @frames --json");
+    assert_eq!(status, 0, "{run}");
+    let frames = run["frames"].as_array().expect("frames");
+    assert_eq!(frames.len(), ran.len());
+    ran.into_iter()
+        .zip(frames.iter().cloned())
+        .inspect(|(step, frame)| assert_eq!(step["name"], frame["name"]))
+        .collect()
+}
+
 /// The firmware's sensors and the host's preparation of frames are two programs.
 #[test]
 fn waypoints_are_those_of_the_same_frames_in_a_directory() {
     for system in [System::TransFuser, System::LateFusion, System::Aim] {
         let folder = project(system, |_, _| ());
         let document = drive(&folder, "");
-        let mut expected = Vec::new();
-        for step in steps(&document).iter().filter(|step| step["goal_m"].is_array()) {
-            let name = step["name"].as_str().expect("a name");
-            for file in ["rgb.png", "lidar.bin"] {
-                folder.write(&format!("frames/{name}/{file}"), folder.read(&format!("log/frames/{name}/{file}")));
+        let rules = if system == System::TransFuser { Rules::TRANSFUSER } else { Rules::BASELINES };
+        for (index, (step, frame)) in run_frames(&folder, &document).iter().enumerate() {
+            assert_eq!(frame["waypoints"], step["int8"]["waypoints"], "{system:?}, {}", step["name"]);
+            if index == 0 {
+                let [alone, driven] = [&frame["controls"], &step["int8"]].map(controls);
+                assert_eq!(alone, driven, "{system:?}: the controller has nothing to remember yet");
             }
-            let description = json!({"speed": step["speed_mps"], "goal": step["goal_m"]});
-            folder.write(&format!("frames/{name}/frame.json"), description.to_string());
-            expected.push((name, &step["int8"]["waypoints"]));
+            let points = [0, 1].map(|k| pair(&frame["waypoints"][k]));
+            assert_follows(&frame["controls"], Agent::new(rules).step(points, number(&step["speed_mps"])));
         }
-        let (status, run) = folder.json("host-sim run @net.img --frames @frames --json");
-        assert_eq!(status, 0, "{run}");
-        let frames = run["frames"].as_array().expect("frames");
-        let found: Vec<_> = frames.iter().map(|f| (f["name"].as_str().expect("a name"), &f["waypoints"])).collect();
-        assert_eq!(found, expected, "{system:?}");
     }
+}
+
+#[test]
+fn without_a_speed_a_frame_has_waypoints_and_no_controls() {
+    let folder = project(System::Aim, |_, _| ());
+    let document = drive(&folder, "");
+    let whole = run_frames(&folder, &document);
+    let goal = |frame: &str| json!({"goal": steps(&document)[frame.parse::<usize>().expect("a number")]["goal_m"]});
+    let mut fast = goal("0002");
+    fast["speed"] = "fast".into();
+    folder.write("frames/0001/frame.json", goal("0001").to_string());
+    folder.write("frames/0002/frame.json", fast.to_string());
+    let (status, run) = folder.json("host-sim run @net.img --frames @frames --json");
+    assert_eq!(status, 0, "{run}");
+    for (index, (_, frame)) in whole.iter().enumerate() {
+        let found = &run["frames"][index];
+        assert_eq!(found["waypoints"], frame["waypoints"]);
+        assert_eq!(found["controls"], if index < 2 { Value::Null } else { frame["controls"].clone() });
+    }
+    let table = folder.ok("host-sim run @net.img --frames @frames");
+    assert!(table.contains("controls of a controller in its fresh state"), "{table}");
+    assert!(table.lines().any(|line| line.trim().starts_with("0002") && line.trim().ends_with('–')), "{table}");
+}
+
+/// The network gives its controls itself; the agent lets throttle and brake exclude each other.
+#[test]
+fn controls_of_cilrs_are_those_of_the_same_frames_in_a_directory() {
+    let folder = project(System::Cilrs, |_, _| ());
+    let document = drive(&folder, " --model @net.safetensors");
+    assert_eq!(document["summary"]["driven"], 15);
+    let ran = run_frames(&folder, &document);
+    assert_eq!(ran.len(), STEPS - 1);
+    for (step, frame) in &ran {
+        assert_eq!(step["command"], 3);
+        let [steer, throttle, brake] = controls(&frame["controls"]);
+        let brake = if brake < 0.05 || throttle > brake { 0.0 } else { brake };
+        assert_eq!(controls(&step["int8"]), [steer, throttle, brake], "{}", step["name"]);
+        let apart = controls(&step["int8"]).into_iter().zip(controls(&step["f32"])).map(|(i, f)| (i - f).abs());
+        assert!(apart.take(2).all(|apart| apart < 0.1), "{step}");
+        assert!(step["int8"]["waypoints"].is_null() && step["waypoint_distance_m"].is_null(), "{step}");
+    }
+}
+
+#[test]
+fn lbc_drives_to_the_ground_that_its_points_show() {
+    let folder = project(System::Lbc, |_, _| ());
+    let document = drive(&folder, &format!(" --model @net.safetensors{SHARP}"));
+    let mut agent = Agent::new(Rules::BASELINES);
+    for (step, frame) in run_frames(&folder, &document) {
+        let [first, second] = [0, 1].map(|k| ground(pair(&frame["points"][k])));
+        let (Some(first), Some(second)) = (first, second) else { panic!("above the horizon: {frame}") };
+        let speed = number(&step["speed_mps"]);
+        assert_follows(&frame["controls"], Agent::new(Rules::BASELINES).step([first, second], speed));
+        assert_follows(&step["int8"], agent.step([first, second], speed));
+    }
+    assert_eq!((&document["summary"]["driven"], &document["summary"]["difference"]["steps"]), (&15.into(), &15.into()));
 }
 
 #[test]
@@ -236,6 +339,12 @@ fn what_is_wrong_with_a_log_is_said_with_its_place() {
     folder.write("other.safetensors", other.read("net.safetensors"));
     let outcome = folder.run("host-sim drive @net.img --log @log --model @other.safetensors");
     assert!(outcome.err.contains("it reads `velocity`, which the image does not"), "{}", outcome.err);
+    let lbc = golden::write_safetensors(&Lbc::small().tensors(), &folder.path("lbc.safetensors"));
+    lbc.expect("a writable folder");
+    folder.write("views.safetensors", views_file(&build::views((48, 64))));
+    folder.ok("model-compiler compile @lbc.safetensors --resolution 48x64 --calib @views.safetensors -o @lbc.img");
+    let outcome = folder.run("host-sim drive @lbc.img --log @log");
+    assert!(outcome.err.contains("it is 48×64×10, the goal is drawn on 144×256×10"), "{}", outcome.err);
     let outcome = folder.run("host-sim drive @net.img --log @log --model @net.safetensors --resolution 64x64");
     assert!(outcome.err.contains("its input `rgb` is 64×64×3, the image's 256×256×3"), "{}", outcome.err);
 }

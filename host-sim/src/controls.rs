@@ -1,6 +1,8 @@
-//! Steer, throttle and brake of a network that gives them itself, and how far int8 is from f32 there.
+//! Steer, throttle and brake: of a network that gives them itself, with how far int8 is from f32 there; of others from
+//! the firmware's controller.
 
 use crate::statistics::Spread;
+use firmware::drive;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::borrow::Cow;
@@ -11,7 +13,8 @@ const CONTROLS: &str = "controls";
 /// gate on controls nor the order of frames counts its error.
 pub const PREDICTED_SPEED: &str = "predicted_speed";
 
-/// Raw outputs of the network, before the agent's post-processing.
+/// What the actuators would be told. Of a network that gives controls itself they are its raw outputs, before the
+/// agent's post-processing.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Controls {
     /// −1 (left) to 1 (right).
@@ -29,7 +32,13 @@ impl Controls {
     }
 }
 
-/// What such a network gives for one frame.
+impl From<drive::Controls> for Controls {
+    fn from(drive::Controls { steer, throttle, brake }: drive::Controls) -> Self {
+        Self { steer: steer.to_num(), throttle: throttle.to_num(), brake: brake.to_num() }
+    }
+}
+
+/// What a network that gives controls says of one frame.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct ControlPrediction {
     /// How to drive.

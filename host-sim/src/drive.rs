@@ -9,16 +9,19 @@
 //! has a driver of its own, so that a difference in one step is in the memory of the later ones as it would be on the
 //! road. The format of a log is described at [`log`].
 
+use crate::answer::Answer;
 use crate::backends::Backend;
 use crate::files::{self, ImageFile};
+use crate::points::PixelGrid;
 use crate::run::{ModelInfo, Waypoints};
+use crate::system;
 use firmware::drive::{Driver, NetworkInputs, Output, Reading, RouteNode, Status, Step};
 use indicatif::ProgressBar;
 use log::{Log, LoggedFrame};
 use model_compiler::artifact;
 use model_compiler::error::Result;
 use model_compiler::import::ImportOptions;
-use network::{Answer, FloatNetwork, IntegerNetwork};
+use network::{FloatNetwork, IntegerNetwork};
 use schemars::JsonSchema;
 use sensors::Rig;
 use serde::Serialize;
@@ -157,8 +160,9 @@ impl Seat<'_> {
 pub fn drive(options: &Options, progress: &ProgressBar) -> Result<DriveReport> {
     let file = ImageFile::read(&options.image)?;
     let image = file.parse()?;
-    let system = network::system(&image)?;
-    let profile = system.profile();
+    let system = system::of_image(&image)?;
+    let maps = image.output(0).and_then(|port| PixelGrid::of_image(&image, port.tensor));
+    let profile = system::profile(system, maps);
     let rig = Rig::new(&image, system)?;
     let log = Log::read(&options.log)?;
     let mut integers = IntegerNetwork::new(image, options.backend, profile.answer)?;

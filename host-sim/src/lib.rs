@@ -4,6 +4,7 @@
 //! * [`mod@bench`]: latency per step and whole, the backends side by side
 //! * [`demo`]: the whole way on the files of the source tree, without arguments
 //! * [`run`]: waypoints, [`controls`], [`points`] or classes of frames, int8 from an image or f32 from a checkpoint
+//! * [`system`]: which of the published systems a network is; [`answer`]: its output as the firmware's driver takes it
 //! * [`verify`]: the engine's bytes against an independent f64 model of the arithmetic, step by step, and beside it the
 //!   f32 network: how much precision each step costs
 //! * [`attention`]: how often the fusing transformer looks from one sensor to the other, in integers and in f32
@@ -22,6 +23,7 @@
 #![forbid(unsafe_code)]
 
 pub mod ablation;
+pub mod answer;
 pub mod attention;
 pub mod backends;
 pub mod bench;
@@ -44,6 +46,7 @@ pub mod points;
 pub mod report;
 pub mod run;
 pub mod statistics;
+pub mod system;
 pub mod trace;
 pub mod verify;
 

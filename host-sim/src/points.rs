@@ -17,7 +17,7 @@ pub struct PixelGrid {
 }
 
 impl PixelGrid {
-    fn of_shape(shape: Shape) -> Self {
+    pub(crate) fn of_shape(shape: Shape) -> Self {
         Self { height: shape.height, width: shape.width }
     }
 
@@ -42,6 +42,11 @@ impl PixelGrid {
     /// The maps behind the first output of a graph; `None` where it holds no points.
     pub fn of_graph(graph: &Graph) -> Option<Self> {
         logits(graph).map(|logits| Self::of_shape(graph.value(logits).shape))
+    }
+
+    /// Columns and rows.
+    pub fn size(self) -> [u16; 2] {
+        [self.width, self.height]
     }
 
     /// Points of `[column, row]` pairs in pixels.

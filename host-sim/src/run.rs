@@ -1,12 +1,16 @@
 //! Waypoints, controls, points or classes of frames: int8 from an image, f32 from a checkpoint.
 
+use crate::answer::Answer;
 use crate::backends::Backend;
 use crate::buffers::GuardedArena;
 use crate::classification::{Accuracy, Classification};
 use crate::codes::decode;
-use crate::controls::{ControlOutputs, ControlPrediction};
+use crate::controls::{ControlOutputs, ControlPrediction, Controls};
 use crate::files::{self, FrameSource, ImageFile};
 use crate::points::{PixelGrid, Points};
+use crate::system;
+use firmware::drive::profile::Answer as AnswerKind;
+use firmware::drive::{Profile, Real};
 use firmware::engine::{Engine, EngineError};
 use firmware::image::{Image, Port, TensorRecord};
 use firmware::program::Step;
@@ -14,7 +18,7 @@ use firmware::tensor::ElementType;
 use indicatif::ProgressBar;
 use model_compiler::artifact;
 use model_compiler::error::{Error, ErrorCode, Result};
-use model_compiler::frames::{Frame, FrameFormat};
+use model_compiler::frames::{Frame, FrameFormat, input_name};
 use model_compiler::import::ImportOptions;
 use model_compiler::integer_reference;
 use model_compiler::ir::{Graph, Op};
@@ -37,7 +41,7 @@ pub struct ModelInfo {
 }
 
 /// Result of one frame.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct FrameResult {
     /// Frame.
     pub name: String,
@@ -47,13 +51,17 @@ pub struct FrameResult {
 }
 
 /// What networks give.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 #[serde(untagged)]
 pub enum Output {
     /// Of a driving network.
     Waypoints {
         /// Where to drive.
         waypoints: Waypoints,
+        /// How to drive there: of the firmware's controller in its fresh state, so of no frame before. Absent where the
+        /// frame tells no speed, the network is of no published system, or the waypoints are no possible plan.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        controls: Option<Controls>,
     },
     /// Of a driving network that gives controls.
     Controls(ControlPrediction),
@@ -61,13 +69,16 @@ pub enum Output {
     Points {
         /// Where to drive.
         points: Points,
+        /// How to drive there, as of waypoints. Absent also where a point shows no ground.
+        #[serde(skip_serializing_if = "Option::is_none")]
+        controls: Option<Controls>,
     },
     /// Of a classifier.
     Class(Classification),
 }
 
 /// Result of a run.
-#[derive(Clone, Debug, PartialEq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Serialize, JsonSchema)]
 pub struct RunReport {
     /// Version of this structure.
     pub schema: u32,
@@ -131,8 +142,9 @@ fn run_image(file: &ImageFile, source: &FrameSource, backend: Backend, progress:
     let pairs = points.or(gives_pairs.then_some(OutputKind::Waypoints));
     let names = device.outputs.iter().map(|(port, _)| port.name);
     let kind = OutputKind::of(pairs, names, &format, image.name())?;
+    let reader = Reader::new(kind, &system::input_names(&image));
     let frames = source.load(&format)?;
-    let results = each_frame(&frames, progress, |frame| kind.read(device.infer(frame)?, frame))?;
+    let results = each_frame(&frames, progress, |frame| reader.read(device.infer(frame)?, frame))?;
     let model = ModelInfo { name: image.name().to_owned(), sha256: artifact::hex(&file.sha256()) };
     Ok(RunReport::new(model, results).with_names(&frames))
 }
@@ -145,11 +157,13 @@ fn run_graph(graph: &Graph, model: ModelInfo, source: &FrameSource, progress: &P
     let pairs = points.or(gives_waypoints.then_some(OutputKind::Waypoints));
     let names = graph.outputs.iter().map(|&id| graph.value(id).name.as_str());
     let kind = OutputKind::of(pairs, names, &format, &graph.name)?;
+    let inputs: Vec<&str> = graph.inputs().map(|(_, kind)| input_name(kind)).collect();
+    let reader = Reader::new(kind, &inputs);
     let frames = source.load(&format)?;
     let results = each_frame(&frames, progress, |frame| {
         let inputs: Vec<Vec<f32>> = graph.inputs().map(|(_, kind)| frame.raw(kind)).collect::<Result<_>>()?;
         let outputs = reference::run(graph, &inputs, |_, _| ())?;
-        kind.read(outputs.into_iter().map(|output| output.into_iter().map(f64::from).collect()).collect(), frame)
+        reader.read(outputs.into_iter().map(|output| output.into_iter().map(f64::from).collect()).collect(), frame)
     })?;
     Ok(RunReport::new(model, results).with_names(&frames))
 }
@@ -169,7 +183,7 @@ fn each_frame(
     frames.iter().map(&mut result).collect()
 }
 
-/// How the outputs are to be read.
+/// What kind of outputs they are.
 #[derive(Clone, Copy)]
 enum OutputKind {
     Waypoints,
@@ -193,17 +207,49 @@ impl OutputKind {
             Error::new(ErrorCode::Unsupported, format!("network {network}"), message)
         })
     }
+}
+
+/// Reads the outputs of a network.
+struct Reader {
+    kind: OutputKind,
+    /// Of the system whose answers they are, if a controller drives by them.
+    profile: Option<Profile>,
+}
+
+impl Reader {
+    /// For a network with inputs of these names.
+    fn new(kind: OutputKind, inputs: &[&str]) -> Self {
+        let maps = if let OutputKind::Points(maps) = kind { Some(maps) } else { None };
+        let is_answer = |profile: &Profile| match profile.answer {
+            AnswerKind::Waypoints => matches!(kind, OutputKind::Waypoints),
+            AnswerKind::ImagePoints(_) => maps.is_some(),
+            AnswerKind::Controls => false,
+        };
+        let profile = system::of_inputs(inputs).map(|system| system::profile(system, maps)).filter(is_answer);
+        Self { kind, profile }
+    }
 
     /// Reads the real values of all outputs.
-    fn read(self, mut outputs: Vec<Vec<f64>>, frame: &Frame) -> Result<Output> {
-        Ok(match self {
-            Self::Waypoints => Output::Waypoints { waypoints: waypoints(&outputs[0]) },
-            Self::Controls(controls) => Output::Controls(controls.read(&outputs).ok_or_else(|| {
+    fn read(&self, mut outputs: Vec<Vec<f64>>, frame: &Frame) -> Result<Output> {
+        Ok(match self.kind {
+            OutputKind::Waypoints => {
+                Output::Waypoints { waypoints: waypoints(&outputs[0]), controls: self.controls(&outputs[0], frame) }
+            }
+            OutputKind::Controls(controls) => Output::Controls(controls.read(&outputs).ok_or_else(|| {
                 Error::new(ErrorCode::Unsupported, "output `controls`", "expected steer, throttle and brake")
             })?),
-            Self::Points(grid) => Output::Points { points: grid.points(&outputs[0]) },
-            Self::Classes => Output::Class(Classification::new(outputs.swap_remove(0), frame)),
+            OutputKind::Points(grid) => {
+                Output::Points { points: grid.points(&outputs[0]), controls: self.controls(&outputs[0], frame) }
+            }
+            OutputKind::Classes => Output::Class(Classification::new(outputs.swap_remove(0), frame)),
         })
+    }
+
+    /// What the firmware makes of waypoints or points.
+    fn controls(&self, values: &[f64], frame: &Frame) -> Option<Controls> {
+        let (profile, speed) = (self.profile.as_ref()?, Real::saturating_from_num(frame.speed?));
+        let answer = Answer::of_real(&profile.answer, values)?;
+        Some(profile.controls(answer.output().ok()?, speed).ok()?.into())
     }
 }
 
@@ -276,5 +322,26 @@ mod tests {
     fn waypoints_turn_forward_positive() {
         assert_eq!(waypoints(&[0.5_f32, -2.0, 0.0, 0.0]), [[0.5, 2.0], [0.0, 0.0]]);
         assert!(waypoints(&[0.0, 0.0])[0][1].is_sign_positive());
+    }
+
+    #[test]
+    fn controls_need_a_published_system_and_a_possible_speed() {
+        let controls = |inputs: &[&str], speed| {
+            let frame = Frame { speed, ..Frame::default() };
+            let reader = Reader::new(OutputKind::Waypoints, inputs);
+            match reader.read(vec![vec![0.0, -2.0, 0.0, -4.0]], &frame).unwrap() {
+                Output::Waypoints { controls, .. } => controls,
+                other => panic!("{other:?}"),
+            }
+        };
+        let aim = &["rgb", "goal"];
+        let found = controls(aim, Some(1.0)).unwrap();
+        assert_eq!((found.throttle, found.brake), (0.75, 0.0));
+        assert!(found.steer.abs() < 1e-6, "straight ahead: {found:?}");
+        assert_eq!(controls(aim, Some(10.0)).map(|controls| controls.brake), Some(1.0), "4 m/s are wanted");
+        assert_eq!(controls(aim, None), None);
+        assert_eq!(controls(aim, Some(1e30)), None);
+        assert_eq!(controls(&["rgb"], Some(1.0)), None);
+        assert_eq!(controls(&["views"], Some(1.0)), None, "LBC gives points");
     }
 }

@@ -162,6 +162,9 @@ pub struct Frame {
     pub dropped_points: usize,
     /// What is to be seen, where somebody said so.
     pub label: Option<Label>,
+    /// Forward speed, m/s, where the source tells it: for the controller behind a network, whether or not the network
+    /// reads it as [`Self::velocity`].
+    pub speed: Option<f64>,
 }
 
 impl Frame {
@@ -203,8 +206,8 @@ impl Frame {
         }
     }
 
-    /// SHA-256 over everything that a network reads of this frame. The name does not count, nor the command: the
-    /// calibration runs a frame under every command.
+    /// SHA-256 over everything that a network reads of this frame. The name does not count, nor the speed beside the
+    /// network, nor the command: the calibration runs a frame under every command.
     pub fn digest(&self) -> [u8; 32] {
         let mut hash = Sha256::new();
         for kind in InputKind::ALL.into_iter().filter(|&kind| kind != InputKind::Command) {
@@ -306,8 +309,9 @@ mod tests {
         let faster = Frame { name: "c".into(), velocity: Some(4.0), ..frame() };
         let digest = frame().short_digest();
         assert_eq!(digest.len(), 16);
-        let evaluation = [renamed, faster, frame().mirrored()];
-        assert_eq!(overlap(&["0123456789abcdef", &digest], &evaluation), ["b"]);
+        let told = Frame { name: "d".into(), speed: Some(3.5), ..frame() };
+        let evaluation = [renamed, faster, frame().mirrored(), told];
+        assert_eq!(overlap(&["0123456789abcdef", &digest], &evaluation), ["b", "d"]);
         assert!(overlap(&[], &evaluation).is_empty());
     }
 

@@ -81,6 +81,13 @@ impl Agent {
     }
 }
 
+/// The ground, `[right, forward]` in meters, that a point −1..1 of LBC's front view shows; `None` at the horizon and above.
+pub fn ground([x, y]: [f64; 2]) -> Option<[f64; 2]> {
+    let (right, down) = (128.0 * x, 72.0 * y);
+    let depth = 128.0 * 1.3 / down;
+    (down > 0.0).then(|| [right * depth / 140.8, depth - 0.4])
+}
+
 /// The node to head for among `route`, of which the passed nodes are dropped; `[north, east]` in meters.
 ///
 /// # Panics

@@ -10,8 +10,10 @@ const NODES: u32 = 200;
 /// What is written to a log's folder.
 #[derive(Clone, Debug)]
 pub struct Recording {
-    /// Columns and rows of the camera's images.
+    /// Columns and rows of the cameras' images.
     pub image: (u32, u32),
+    /// Files of the cameras.
+    pub cameras: &'static [&'static str],
     /// Steps.
     pub steps: usize,
     /// Of everything random.
@@ -47,10 +49,12 @@ impl Recording {
             }
             folder.write(&format!("{frame}/lidar.bin"), points);
             let (width, height) = self.image;
-            let shade = random.below(64) as u32;
-            let pixel = |x: u32, y: u32| image::Rgb([(x * 5 + shade) as u8, (y * 3) as u8, (x ^ y) as u8]);
-            let picture = image::RgbImage::from_fn(width, height, pixel);
-            picture.save(folder.path(&format!("{frame}/rgb.png"))).expect("a writable folder");
+            for camera in self.cameras {
+                let shade = random.below(64) as u32;
+                let pixel = |x: u32, y: u32| image::Rgb([(x * 5 + shade) as u8, (y * 3) as u8, (x ^ y) as u8]);
+                let picture = image::RgbImage::from_fn(width, height, pixel);
+                picture.save(folder.path(&format!("{frame}/{camera}"))).expect("a writable folder");
+            }
         }
     }
 }

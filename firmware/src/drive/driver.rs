@@ -99,6 +99,15 @@ enum Plan {
     Controls(Controls),
 }
 
+impl Plan {
+    fn controls(self, controller: &mut Controller, speed: Real) -> Controls {
+        match self {
+            Self::Points(points) => controller.step(points, speed),
+            Self::Controls(controls) => controls,
+        }
+    }
+}
+
 /// Answer to [`Driver::step`].
 #[derive(Debug)]
 pub enum Step<'a, const N: usize> {
@@ -239,10 +248,7 @@ impl<const N: usize> Driver<N> {
             return self.safe(Status::Recovering);
         }
         self.plan = Some(plan);
-        let controls = match plan {
-            Plan::Points(points) => self.controller.step(points, speed),
-            Plan::Controls(controls) => controls,
-        };
+        let controls = plan.controls(&mut self.controller, speed);
         self.steer = controls.steer;
         Output { controls, status: Status::Driving }
     }
@@ -259,6 +265,19 @@ impl<const N: usize> Driver<N> {
     fn safe(&mut self, status: Status) -> Output {
         self.counters.safe_steps = self.counters.safe_steps.saturating_add(1);
         Output { controls: Controls::stop(self.steer), status }
+    }
+}
+
+impl Profile {
+    /// Controls of one answer at a speed in m/s, without the steps before: of a controller in its fresh state.
+    ///
+    /// # Errors
+    /// The fault of a [`Driver`]'s step: a speed that the vehicle cannot have, an output that is no possible plan.
+    pub fn controls(&self, output: NetworkOutput<'_>, speed: Real) -> Result<Controls, Fault> {
+        if !within(self.limits.speed, speed) {
+            return Err(Fault::Invalid(Sensor::Speed));
+        }
+        Ok(plan(&self.answer, &self.limits, output)?.controls(&mut Controller::new(self.tuning), speed))
     }
 }
 

@@ -89,7 +89,8 @@ impl Point {
         }
     }
 
-    /// The network's goal input, `floor(2^16·x + 1/2)` of `[right, −forward]`: its y axis points backward.
+    /// The network's goal input, `floor(2^16·x + 1/2)` of `[right, −forward]`: its y axis points backward. From single
+    /// precision, [`crate::sensors::inputs::goal`] gives the same codes.
     pub fn goal_codes(self) -> [I16F16; 2] {
         const HALF: Real = Real::lit("0x0.00008");
         [self.right, self.forward.saturating_neg()].map(|x| I16F16::saturating_from_num(x.saturating_add(HALF)))
@@ -102,7 +103,8 @@ impl From<Waypoint> for Point {
     }
 }
 
-/// The network's velocity input, `sat16(floor(2^8·v + 1/2))` of a speed in m/s.
+/// The network's velocity input, `sat16(floor(2^8·v + 1/2))` of a speed in m/s. From single precision,
+/// [`crate::sensors::inputs::velocity`] gives the same code.
 pub fn velocity_code(speed: Real) -> I8F8 {
     const HALF: Real = Real::lit("0x0.008");
     I8F8::saturating_from_num(speed.saturating_add(HALF))
@@ -112,6 +114,8 @@ pub fn velocity_code(speed: Real) -> I8F8 {
 #[allow(clippy::arithmetic_side_effects, reason = "tests run with overflow checks")]
 mod tests {
     use super::*;
+    use crate::sensors::inputs;
+    use proptest::prelude::*;
 
     fn real(value: f64) -> Real {
         Real::from_num(value)
@@ -147,6 +151,18 @@ mod tests {
             [1.0, -1.0, 0.001953125, 200.0, -200.0].map(|v| velocity_code(real(v)).to_bits()),
             [256, -256, 1, i16::MAX, i16::MIN]
         );
+    }
+
+    proptest! {
+        /// The sensors round single precision, the planner 32 fraction bits.
+        #[test]
+        fn codes_are_those_of_the_sensors(right in -40_000.0_f32..40_000.0, forward in -40_000.0_f32..40_000.0) {
+            let point = Point { right: real(right.into()), forward: real(forward.into()) };
+            let found = point.goal_codes().map(I16F16::to_bits);
+            prop_assert_eq!(Ok(found), inputs::goal([right, -forward].map(f32::to_bits)));
+            let speed = forward / 256.0;
+            prop_assert_eq!(Ok(velocity_code(real(speed.into())).to_bits()), inputs::velocity(speed.to_bits()));
+        }
     }
 
     #[test]

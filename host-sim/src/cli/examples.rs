@@ -34,6 +34,7 @@ pub const DIFF: &str = "Examples:
 
 pub const SCHEMA: &str = "Examples:
   host-sim schema
+  host-sim schema run
   host-sim schema attention
   host-sim schema route-log";
 

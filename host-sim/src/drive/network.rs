@@ -1,92 +1,17 @@
 //! The two networks of a drive: the engine's integers, and the f32 network on the same inputs.
 
 use super::sensors::Rig;
+use crate::answer::Answer;
 use crate::backends::Backend;
 use crate::buffers::GuardedArena;
 use crate::codes::decode;
-use crate::run::Waypoints;
 use firmware::drive::profile::Answer as AnswerKind;
-use firmware::drive::{NetworkError, NetworkOutput, System};
 use firmware::engine::{Engine, EngineError};
 use firmware::image::{Image, Port};
 use firmware::tensor::ElementType;
-use firmware::waypoint::{self, Waypoint};
 use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::ir::Graph;
 use model_compiler::reference;
-
-/// What a network gave, owned.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Answer {
-    /// Waypoints.
-    Waypoints(Vec<Waypoint>),
-    /// Points in the image, `[column, row]` in 1/64 pixel.
-    ImagePoints(Vec<[i32; 2]>),
-    /// Logistic values in Q15.
-    Controls([i16; 3]),
-    /// Nothing that can be driven: a number that is not finite.
-    NotFinite,
-}
-
-impl Answer {
-    /// Reads the integers of the output that drives.
-    fn of_codes(kind: &AnswerKind, codes: &[i32]) -> Option<Self> {
-        let bytes: Vec<u8> = codes.iter().flat_map(|code| code.to_le_bytes()).collect();
-        match kind {
-            AnswerKind::Waypoints => waypoint::read(&bytes).map(|waypoints| Self::Waypoints(waypoints.to_vec())),
-            AnswerKind::ImagePoints(_) => Some(Self::ImagePoints(codes.as_chunks::<2>().0.to_vec())),
-            AnswerKind::Controls => {
-                let codes = <[i32; 3]>::try_from(codes).ok()?;
-                Some(Self::Controls(codes.map(|code| code.clamp(i16::MIN.into(), i16::MAX.into()) as i16)))
-            }
-        }
-    }
-
-    /// As the driver takes it.
-    ///
-    /// # Errors
-    /// There is nothing to drive by.
-    pub fn output(&self) -> std::result::Result<NetworkOutput<'_>, NetworkError> {
-        match self {
-            Self::Waypoints(waypoints) => Ok(NetworkOutput::Waypoints(waypoints)),
-            Self::ImagePoints(points) => Ok(NetworkOutput::ImagePoints(points)),
-            Self::Controls(codes) => Ok(NetworkOutput::Controls(*codes)),
-            Self::NotFinite => Err(NetworkError::Failed),
-        }
-    }
-
-    /// Waypoints in meters, where the network gives such.
-    pub fn waypoints(&self) -> Option<Waypoints> {
-        match self {
-            Self::Waypoints(waypoints) => {
-                Some(waypoints.iter().map(|w| [w.right, w.forward].map(|meters| meters.to_num())).collect())
-            }
-            _ => None,
-        }
-    }
-}
-
-/// The system of an image, from the names of its inputs.
-///
-/// # Errors
-/// They are those of no driving network.
-pub fn system(image: &Image<'_>) -> Result<System> {
-    let names: Vec<&str> = (0..image.input_count()).filter_map(|i| Some(image.input(i)?.name)).collect();
-    let reads = |name: &str| names.contains(&name);
-    match (reads("rgb"), reads("bev"), reads("goal")) {
-        _ if reads("views") => Ok(System::Lbc),
-        (true, false, false) if reads("command") => Ok(System::Cilrs),
-        (true, true, true) if reads("bev_points") => Ok(System::GeometricFusion),
-        (true, true, true) if reads("velocity") => Ok(System::TransFuser),
-        (true, true, true) => Ok(System::LateFusion),
-        (true, false, true) => Ok(System::Aim),
-        _ => {
-            let message = format!("it reads {}, which is no driving network's set of inputs", names.join(", "));
-            let error = Error::new(ErrorCode::Unsupported, format!("network {}", image.name()), message);
-            Err(error.with_help("host-sim run shows what other networks give"))
-        }
-    }
-}
 
 /// Name of the output that holds controls; waypoints and points are the first output.
 const CONTROLS: &str = "controls";
@@ -174,17 +99,7 @@ impl FloatNetwork {
         let inputs: Vec<Vec<f32>> = self.graph.inputs().map(|(_, kind)| raw(kind.name())).collect();
         let outputs = reference::run(&self.graph, &inputs, |_, _| ())?;
         let values = outputs.get(self.output).map_or(&[][..], Vec::as_slice);
-        if !values.iter().all(|value| value.is_finite()) {
-            return Ok(Answer::NotFinite);
-        }
-        // To the codes of an image's output: Q16 meters, 1/64 pixel, Q15. A cast saturates.
-        let factor = match self.kind {
-            AnswerKind::Waypoints => 65536.0,
-            AnswerKind::ImagePoints(_) => 64.0,
-            AnswerKind::Controls => 32768.0,
-        };
-        let codes: Vec<i32> = values.iter().map(|&value| (f64::from(value) * factor + 0.5).floor() as i32).collect();
-        Answer::of_codes(&self.kind, &codes).ok_or_else(|| unreadable(&self.graph.name))
+        Answer::of_real(&self.kind, values).ok_or_else(|| unreadable(&self.graph.name))
     }
 }
 

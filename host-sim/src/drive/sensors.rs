@@ -28,7 +28,7 @@ impl<'a> Rig<'a> {
     /// The sensors for an image.
     ///
     /// # Errors
-    /// An input that no sensor of a log fills, or a histogram of an impossible size.
+    /// A histogram of an impossible size, or views on which no goal is drawn.
     pub fn new(image: &Image<'a>, system: System) -> Result<Self> {
         let ports = (0..image.input_count()).filter_map(|index| image.input(index));
         let ports: Vec<_> = ports.filter_map(|port| Some((port, image.tensor(port.tensor)?.shape))).collect();
@@ -36,6 +36,13 @@ impl<'a> Rig<'a> {
         let bev = ports.iter().find(|(port, _)| port.name == "bev");
         let histogram = bev.map(|&(_, shape)| Histogram::new(shape, split)).transpose();
         let histogram = histogram.map_err(|e| Error::new(ErrorCode::Unsupported, "input `bev`", e.to_string()))?;
+        let views = ports.iter().find(|(port, shape)| port.name == "views" && *shape != heatmap::MAP);
+        if let Some((_, found)) = views {
+            let [found, expected] = [*found, heatmap::MAP].map(|s| format!("{}×{}×{}", s.height, s.width, s.channels));
+            let message = format!("it is {found}, the goal is drawn on {expected}");
+            let error = Error::new(ErrorCode::Unsupported, "input `views`", message);
+            return Err(error.with_help(format!("compile the network for {expected}; host-sim run takes any size")));
+        }
         Ok(Self { ports, histogram })
     }
 

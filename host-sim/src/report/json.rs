@@ -43,6 +43,8 @@ pub fn diff(diff: &Diff, gates: &[GateOutcome], failure: Option<&Error>) -> Valu
 /// Documents that have a JSON Schema.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 pub enum Document {
+    /// Of a run.
+    Run,
     /// Of a verification.
     Verify,
     /// Of attention statistics.
@@ -59,6 +61,7 @@ pub enum Document {
 pub fn schema(document: Document) -> Value {
     let written = || SchemaSettings::default().for_serialize().into_generator();
     let schema = match document {
+        Document::Run => written().into_root_schema_for::<RunReport>(),
         Document::Verify => written().into_root_schema_for::<VerifyReport>(),
         Document::Attention => written().into_root_schema_for::<AttentionReport>(),
         Document::Score => written().into_root_schema_for::<Score>(),
@@ -171,6 +174,7 @@ fn to_value(report: &impl Serialize) -> Value {
 mod tests {
     use super::*;
     use crate::classification::Classification;
+    use crate::controls::Controls;
     use crate::run::{FrameResult, ModelInfo, Output};
     use model_compiler::error::ErrorCode;
     use model_compiler::frames::{Frame, Label};
@@ -178,12 +182,21 @@ mod tests {
     #[test]
     fn run_has_the_documented_shape() {
         let model = ModelInfo { name: "mini".into(), sha256: "00".into() };
-        let output = Output::Waypoints { waypoints: vec![[0.5, 2.0]] };
-        let document = run(&RunReport::new(model, vec![FrameResult { name: "a".into(), output }]));
+        let controls = Some(Controls { steer: 0.25, throttle: 0.75, brake: 0.0 });
+        let outputs = [
+            Output::Waypoints { waypoints: vec![[0.5, 2.0]], controls },
+            Output::Waypoints { waypoints: vec![[0.5, 2.0]], controls: None },
+            Output::Points { points: vec![[0.5, -1.0]], controls },
+        ];
+        let frames = outputs.into_iter().map(|output| FrameResult { name: "a".into(), output });
+        let document = run(&RunReport::new(model, frames.collect()));
+        let controls = json!({"steer": 0.25, "throttle": 0.75, "brake": 0.0});
         let expected = json!({
             "schema": 1,
             "model": {"name": "mini", "sha256": "00"},
-            "frames": [{"name": "a", "waypoints": [[0.5, 2.0]]}],
+            "frames": [{"name": "a", "waypoints": [[0.5, 2.0]], "controls": controls},
+                       {"name": "a", "waypoints": [[0.5, 2.0]]},
+                       {"name": "a", "points": [[0.5, -1.0]], "controls": controls}],
         });
         assert_eq!(document, expected);
     }

@@ -5,59 +5,24 @@ use super::{FrameReport, StepReport, VerifyReport, classes, controls};
 use crate::ablation::Row;
 use crate::diff::{Diff, FigureChange, MENTIONED_DB, StepChange};
 use crate::gates::GateOutcome;
-use crate::run::{FrameResult, ModelInfo, Output, RunReport, Waypoints};
+use crate::run::{ModelInfo, Waypoints};
 use comfy_table::{CellAlignment, ContentArrangement, Table, presets};
 use std::fmt::Write;
 
 mod attention;
 mod bench;
 mod drive;
+mod run;
 mod score;
 
 pub use attention::attention;
 pub use bench::bench;
 pub use drive::drive;
+pub use run::run;
 pub use score::score;
 
 /// Changed steps that a terminal shows.
 const MAX_CHANGES: usize = 20;
-
-/// Waypoints, controls, points or classes of every frame.
-pub fn run(report: &RunReport) -> String {
-    let head = format!("{} (sha256 {}…)", report.model.name, &report.model.sha256[..16]);
-    let pairs = |frame: &FrameResult| match &frame.output {
-        Output::Waypoints { waypoints: pairs } | Output::Points { points: pairs } => {
-            Some((frame.name.clone(), pairs.clone()))
-        }
-        Output::Controls(_) | Output::Class(_) => None,
-    };
-    let given = report.frames.iter().filter_map(|frame| match &frame.output {
-        Output::Controls(prediction) => Some((frame.name.as_str(), prediction)),
-        Output::Waypoints { .. } | Output::Points { .. } | Output::Class(_) => None,
-    });
-    let given: Vec<_> = given.collect();
-    if !given.is_empty() {
-        return format!("{head}, controls as the network gives them\n\n{}", controls::run(&given));
-    }
-    let driven: Vec<(String, Waypoints)> = report.frames.iter().filter_map(pairs).collect();
-    if driven.is_empty() {
-        return format!("{head}\n\n{}", classes::run(report));
-    }
-    let points = report.frames.iter().any(|frame| matches!(frame.output, Output::Points { .. }));
-    let (axes, unit) = match points {
-        true => (["x", "y"], "points from −1 (left, top) to 1 (right, bottom)"),
-        false => (["right", "forward"], "waypoints in meters"),
-    };
-    let longest = driven.iter().map(|(_, pairs)| pairs.len()).max().unwrap_or(0);
-    let columns = (1..=longest).flat_map(|k| axes.map(|axis| format!("{axis} {k}")));
-    let header = ["frame".to_owned()].into_iter().chain(columns);
-    let row = |(name, pairs): &(String, Waypoints)| {
-        let values = pairs.iter().flatten().map(|value| format!("{value:.3}"));
-        [name.clone()].into_iter().chain(values).collect()
-    };
-    let table = table(header.collect(), &[0], driven.iter().map(row));
-    format!("{head}, {unit}\n\n{table}\n")
-}
 
 /// The steps and the summary of a verification.
 pub fn verify(report: &VerifyReport) -> String {
@@ -251,32 +216,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn waypoints_stand_in_columns() {
-        let model = ModelInfo { name: "mini".into(), sha256: "ab".repeat(32) };
-        let frame = |name: &str, x: f64| {
-            let waypoints = vec![[x, 2.0], [-x, 14.25]];
-            FrameResult { name: name.into(), output: Output::Waypoints { waypoints } }
-        };
-        let text = run(&RunReport::new(model, vec![frame("a", 0.5), frame("long name", -10.0)]));
-        let lines: Vec<&str> = text.lines().skip(2).collect();
-        assert_eq!(
-            lines[0].split_whitespace().collect::<Vec<_>>().join(" "),
-            "frame right 1 forward 1 right 2 forward 2"
-        );
-        assert!(lines[1].ends_with("14.250") && lines[2].ends_with("14.250"));
-        assert_eq!(lines[1].len(), lines[2].len(), "{text}");
-        assert!(text.starts_with("mini (sha256 abababababababab…)"));
-    }
-
-    #[test]
-    fn points_stand_in_columns_and_their_errors_in_pixels() {
-        let model = ModelInfo { name: "mini".into(), sha256: "ab".repeat(32) };
-        let output = Output::Points { points: vec![[-0.5, 1.0], [0.25, 0.0]] };
-        let text = run(&RunReport::new(model, vec![FrameResult { name: "a".into(), output }]));
-        assert!(text.starts_with("mini (sha256 abababababababab…), points from −1 (left, top)"), "{text}");
-        let words: Vec<Vec<&str>> = text.lines().skip(2).map(|line| line.split_whitespace().collect()).collect();
-        assert_eq!(words[0], ["frame", "x", "1", "y", "1", "x", "2", "y", "2"]);
-        assert_eq!(words[1], ["a", "-0.500", "1.000", "0.250", "0.000"]);
+    fn errors_of_points_are_in_pixels() {
         let mut report = super::super::tests::report();
         report.summary.point_error_px = vec![super::super::MeanAndMax { mean: 0.25, max: 1.5 }];
         assert!(summary(&report).contains("point 1                0.25 px off on average, 1.50 px at most"));

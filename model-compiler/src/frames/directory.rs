@@ -74,6 +74,7 @@ fn load_frame(folder: &Path, format: &FrameFormat) -> Result<Frame> {
         camera_points,
         dropped_points,
         label: None,
+        speed: as_f32_range(&description.json["speed"]),
     })
 }
 
@@ -237,6 +238,7 @@ mod tests {
         assert_eq!(frames.len(), 1);
         let frame = &frames[0];
         assert_eq!((frame.name.as_str(), frame.velocity, frame.command), ("one", Some(4.5), Some(4)));
+        assert_eq!(frame.speed, frame.velocity);
         assert_eq!(frame.goal, Some([1.5, -25.0]), "forward is negative in the network's frame");
         assert_eq!(frame.rgb.as_ref().unwrap().data, [1, 1, 9, 2, 1, 9, 1, 2, 9, 2, 2, 9]);
         let bev = &frame.bev.as_ref().unwrap().data;
@@ -327,6 +329,22 @@ mod tests {
         assert!(frame.bev.is_none() && frame.velocity.is_none() && frame.command.is_none());
         let message = load(root.path(), &FrameFormat { command: true, ..aim }).unwrap_err().to_string();
         assert!(message.contains("frame.json: `command`: missing, expected 1..6"), "{message}");
+    }
+
+    #[test]
+    fn a_speed_that_no_network_reads_is_kept_where_it_is_one() {
+        let aim = FrameFormat::new("aim", [(InputKind::Image, Shape::map(4, 4, 3))]);
+        let speeds = [
+            (r#"{"speed": 4.5}"#, Some(4.5)),
+            ("{}", None),
+            (r#"{"speed": "fast"}"#, None),
+            (r#"{"speed": 1e39}"#, None),
+        ];
+        let frames = speeds.map(|(json, speed)| (load(directory(json).path(), &aim).unwrap().remove(0), speed));
+        for (frame, speed) in &frames {
+            assert_eq!((frame.speed, frame.velocity), (*speed, None));
+            assert_eq!(frame.digest(), frames[1].0.digest(), "a digest is of what the network reads");
+        }
     }
 
     #[test]

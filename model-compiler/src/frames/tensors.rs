@@ -38,6 +38,7 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
     let command = batch.commands(format.command)?;
     let views = format.views.map(|shape| batch.views("lbc_input", shape)).transpose()?;
     let count = batch.frames.unwrap_or(0);
+    let speeds = batch.speeds();
     let labels = format.classes.map(|classes| batch.labels(classes)).transpose()?.flatten();
     if count == 0 {
         return Err(Error::new(ErrorCode::Frames, "", "holds no frame that this network could read"));
@@ -54,6 +55,7 @@ fn frames(file: &SafeTensors<'_>, stem: &str, format: &FrameFormat) -> Result<Ve
         camera_points: camera_points.as_ref().map(|maps| maps[i].clone()),
         dropped_points: 0,
         label: labels.as_ref().map(|labels| labels[i].clone()),
+        speed: speeds.as_ref().and_then(|speeds| speeds[i]),
     };
     Ok((0..count).map(frame).collect())
 }
@@ -175,6 +177,14 @@ impl<'a> Batch<'a> {
         }
     }
 
+    /// Forward speeds where `velocity` holds such for these frames, whether or not the network reads them.
+    fn speeds(&self) -> Option<Vec<Option<f64>>> {
+        let fits = |v: &TensorView<'_>| v.dtype() == Dtype::F32 && v.shape() == [self.frames.unwrap_or(0)];
+        let view = self.file.tensor("velocity").ok().filter(fits)?;
+        let speeds = view.data().as_chunks::<4>().0.iter().map(|&bytes| f32::from_le_bytes(bytes));
+        Some(speeds.map(|speed| speed.is_finite().then(|| speed.into())).collect())
+    }
+
     /// Commands of a network that reads them; of others used where they fit, ignored where not.
     fn commands(&mut self, needed: bool) -> Result<Option<Vec<u8>>> {
         let found = match needed {
@@ -283,6 +293,24 @@ mod tests {
         assert!(message(&commands(Dtype::F32, &[1])).contains("tensor `command`: F32 [1], expected I32 [N]"));
         assert!(message(&good()[..1]).contains("tensor `command`: missing; this network needs it"));
         assert_eq!(load_tensors(&good()[..4]).unwrap()[0].command, None, "others do not");
+    }
+
+    #[test]
+    fn a_speed_that_no_network_reads_is_kept_where_it_is_one() {
+        let aim = FrameFormat { velocity: false, ..format() };
+        let speeds = |change: fn(&mut Tensor)| {
+            let mut tensors = good();
+            change(&mut tensors[2]);
+            let frames = load_as(&aim, &tensors).unwrap();
+            assert!(frames.iter().all(|frame| frame.velocity.is_none()));
+            frames.iter().map(|frame| frame.speed).collect::<Vec<_>>()
+        };
+        assert_eq!(speeds(|_| ()), [Some(1.5), Some(2.5)]);
+        assert_eq!(speeds(|tensor| tensor.3[..4].copy_from_slice(&f32::NAN.to_le_bytes())), [None, Some(2.5)]);
+        assert_eq!(speeds(|tensor| tensor.0 = "other"), [None; 2]);
+        assert_eq!(speeds(|tensor| tensor.1 = Dtype::I32), [None; 2]);
+        assert_eq!(speeds(|tensor| tensor.2 = vec![1, 2]), [None; 2]);
+        assert_eq!(load_tensors(&good()).unwrap()[1].speed, Some(2.5));
     }
 
     #[test]

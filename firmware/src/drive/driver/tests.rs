@@ -243,6 +243,31 @@ fn outputs_that_are_no_plan_stop_the_vehicle() {
     }
 }
 
+/// The first step that drives has nothing to remember either.
+#[test]
+fn controls_of_one_answer_are_those_of_the_first_driven_step() {
+    let points = [[8160, 7000], [9000, 6000]];
+    let answers = [
+        (System::TransFuser, NetworkOutput::Waypoints(&waypoints())),
+        (System::Aim, NetworkOutput::Waypoints(&waypoints()[..2])),
+        (System::Cilrs, NetworkOutput::Controls([20_000, 9_000, 1_000])),
+        (System::Lbc, NetworkOutput::ImagePoints(&points)),
+    ];
+    for (system, answer) in answers {
+        let mut driver = driver(system);
+        step(&mut driver, &healthy());
+        let Step::Network(pending) = driver.step(&healthy()) else { panic!("the network runs") };
+        let driven = pending.finish(Ok(answer));
+        assert_eq!(driven.status, Status::Driving, "{system:?}");
+        assert_eq!(system.profile().controls(answer, Real::from(3)), Ok(driven.controls), "{system:?}");
+    }
+    let aim = System::Aim.profile();
+    let answer = NetworkOutput::Waypoints(&waypoints()[..1]);
+    assert_eq!(aim.controls(answer, Real::ONE), Err(Fault::InvalidOutput));
+    let answer = NetworkOutput::Controls([0; 3]);
+    assert_eq!(aim.controls(answer, Real::from(101)), Err(Fault::Invalid(Sensor::Speed)));
+}
+
 #[test]
 fn every_status_has_a_code_of_its_own() {
     let sensors = [Sensor::Camera, Sensor::Lidar, Sensor::Speed, Sensor::Position, Sensor::Compass];
