@@ -18,7 +18,7 @@ use firmware::tensor::ElementType;
 use indicatif::ProgressBar;
 use model_compiler::artifact;
 use model_compiler::error::{Error, ErrorCode, Result};
-use model_compiler::frames::{Frame, FrameFormat, input_name};
+use model_compiler::frames::{Frame, FrameFormat};
 use model_compiler::import::ImportOptions;
 use model_compiler::integer_reference;
 use model_compiler::ir::{Graph, Op};
@@ -157,7 +157,7 @@ fn run_graph(graph: &Graph, model: ModelInfo, source: &FrameSource, progress: &P
     let pairs = points.or(gives_waypoints.then_some(OutputKind::Waypoints));
     let names = graph.outputs.iter().map(|&id| graph.value(id).name.as_str());
     let kind = OutputKind::of(pairs, names, &format, &graph.name)?;
-    let inputs: Vec<&str> = graph.inputs().map(|(_, kind)| input_name(kind)).collect();
+    let inputs: Vec<&str> = graph.inputs().map(|(_, kind)| kind.name()).collect();
     let reader = Reader::new(kind, &inputs);
     let frames = source.load(&format)?;
     let results = each_frame(&frames, progress, |frame| {
