@@ -256,7 +256,8 @@ fn a_published_checkpoint_is_read() {
     let Some(path) = shared_file("data/models/resnet20-12fca82f.th") else { return };
     let checkpoint = read(&path).unwrap_or_else(|error| panic!("{error}"));
     assert_eq!(checkpoint.format(), Format::TorchLegacy);
-    // 19 convolutions, 19 normalizations of four tensors, a classifier of two: saved from DataParallel, torch before 0.4.
+    // 19 convolutions, 19 normalizations of four tensors, a classifier of two: saved from DataParallel, torch before
+    // 0.4.
     assert_eq!(checkpoint.tensors().len(), 19 + 19 * 4 + 2);
     let shape = |name| checkpoint.get(name).map(|tensor| tensor.shape.clone());
     assert_eq!(shape("conv1.weight"), Some(vec![16, 3, 3, 3]));

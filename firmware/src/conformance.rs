@@ -1,8 +1,9 @@
 //! The conformance sweep: any backend against [`Portable`], operator by operator, over seeded random and extreme steps.
 //!
-//! It runs wherever the firmware runs: on a host, in an emulator, on silicon. Every array of a step is drawn on its own,
-//! in one of several styles (random, all at one extreme, extremes in turn), within the bounds that the compiler keeps;
-//! output, residual and scratch begin as garbage. A backend conforms if it writes the very bytes that `Portable` writes.
+//! It runs wherever the firmware runs: on a host, in an emulator, on silicon. Every array of a step is drawn on its
+//! own, in one of several styles (random, all at one extreme, extremes in turn), within the bounds that the compiler
+//! keeps; output, residual and scratch begin as garbage. A backend conforms if it writes the very bytes that `Portable`
+//! writes.
 
 use crate::image::known_answer::Generator;
 use crate::kernels::{Kernels, Portable};
@@ -103,8 +104,8 @@ const OPERATORS: [Operator; 18] = [
     Operator { name: "spatial_softmax", cases: 300, run: tokens::spatial_softmax },
 ];
 
-/// Compares a backend with [`Portable`]. `workspace`: [`WORKSPACE_BYTES`]; what does not fit in a smaller one is left out
-/// and counted.
+/// Compares a backend with [`Portable`]. `workspace`: [`WORKSPACE_BYTES`]; what does not fit in a smaller one is left
+/// out and counted.
 ///
 /// # Errors
 /// The first element that differs.

@@ -1,6 +1,6 @@
-//! Named faults for tests: under the feature `fault-injection` one wrong behavior at a time can be switched on, to prove
-//! that the byte-for-byte comparison and the validation suite would catch it. Without the feature every query is the
-//! constant `false` and disappears. Of the kernels only the portable ones have faults: a query in the inner loop of
+//! Named faults for tests: under the feature `fault-injection` one wrong behavior at a time can be switched on, to
+//! prove that the byte-for-byte comparison and the validation suite would catch it. Without the feature every query is
+//! the constant `false` and disappears. Of the kernels only the portable ones have faults: a query in the inner loop of
 //! another backend would keep the compiler from forming vectors.
 
 /// A wrong behavior; the name says what is done wrong.

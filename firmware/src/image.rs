@@ -2,8 +2,8 @@
 //!
 //! # The format
 //!
-//! The base address is a multiple of 16. Fixed records, 32-bit offsets, no pointers, no compression. Field positions are
-//! the constants of [`layout`], which the compiler's writer uses too.
+//! The base address is a multiple of 16. Fixed records, 32-bit offsets, no pointers, no compression. Field positions
+//! are the constants of [`layout`], which the compiler's writer uses too.
 //!
 //! | part | content | covered by |
 //! |---|---|---|

@@ -2,8 +2,8 @@
 //!
 //! The work of an inference does not depend on its inputs, so seeded ones serve. Steps are timed in inferences of their
 //! own, for the clock is read twice per step and would disturb the whole. Backends take turns within every round, so
-//! that whatever else the machine does hits all of them alike. Nothing is timed before every backend has given the right
-//! bytes in every step.
+//! that whatever else the machine does hits all of them alike. Nothing is timed before every backend has given the
+//! right bytes in every step.
 
 mod clock;
 pub mod figures;

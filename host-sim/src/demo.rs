@@ -1,5 +1,5 @@
-//! What `host-sim` does without arguments: the whole way from a checkpoint to verified waypoints, on files of the source
-//! tree.
+//! What `host-sim` does without arguments: the whole way from a checkpoint to verified waypoints, on files of the
+//! source tree.
 //!
 //! ```text
 //! checkpoint ─► import ─► calibrate, quantize ─► compile for a microcontroller ─► demo.img, demo.record

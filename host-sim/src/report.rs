@@ -1,7 +1,7 @@
 //! What a verification found: the structure, and its forms for people ([`terminal`], [`html`]) and machines ([`json`]).
 //!
-//! The JSON document of `host-sim verify --json`, of `report.json` and of the demo is [`VerifyReport`], field for field;
-//! `host-sim schema` prints its JSON Schema, and those of other documents by name. Rules that hold everywhere:
+//! The JSON document of `host-sim verify --json`, of `report.json` and of the demo is [`VerifyReport`], field for
+//! field; `host-sim schema` prints its JSON Schema, and those of other documents by name. Rules that hold everywhere:
 //!
 //! * SQNR is `10·log10(Σ ref² / Σ (ref − test)²)` in dB, from sums over all frames
 //! * a figure that was not measured is `null`, and so is one that is infinite: where `sqnr_db` is `null` and `cosine` is

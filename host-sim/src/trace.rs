@@ -186,8 +186,8 @@ impl<'a> Tracer<'a> {
         })
     }
 
-    /// Runs a frame without counting it: every value of the f32 network, the own errors of the steps at `positions`, and
-    /// the whole error at `target`, where a step writes that.
+    /// Runs a frame without counting it: every value of the f32 network, the own errors of the steps at `positions`,
+    /// and the whole error at `target`, where a step writes that.
     ///
     /// # Errors
     /// See [`Tracer::trace`].

@@ -1,7 +1,7 @@
 //! Statistics of every graph value over the calibration frames, from the f32 reference.
 //!
-//! Two passes over the frames: the first finds the extremes, the second fills a histogram between them. A few frames run
-//! side by side; sums are taken in f64 over each frame, then over the frames in their order, so the number of cores
+//! Two passes over the frames: the first finds the extremes, the second fills a histogram between them. A few frames
+//! run side by side; sums are taken in f64 over each frame, then over the frames in their order, so the number of cores
 //! changes nothing.
 
 use crate::error::{Error, ErrorCode, Result};

@@ -210,8 +210,8 @@ pub fn read(path: &Path, options: &ImportOptions) -> Result<Graph> {
 /// Builds the float graph of a checkpoint; `name` (the file) names the model and leads error messages.
 ///
 /// Inputs are `rgb`, `bev`, `velocity`, `command`, `bev_points`, `cam_points`, `goal` and `views`, as far as the system
-/// has them, in raw units; the output is `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake) and
-/// `predicted_speed` (m/s), of LBC `points` (pixels). Values carry the names of the checkpoint's modules.
+/// has them, in raw units; the output is `waypoints`, of CILRS `controls` (the sigmoids of steer, throttle and brake)
+/// and `predicted_speed` (m/s), of LBC `points` (pixels). Values carry the names of the checkpoint's modules.
 ///
 /// # Errors
 /// `Unsupported`: no known system, or sizes that do not fit together. `Tensors`: the list of tensors that are missing,

@@ -1,9 +1,9 @@
 //! The independent model of the arithmetic: a quantized network executed in f64, step by step.
 //!
-//! Written from the normative page on numerics and the formulas at the structs of [`firmware::program`] alone; it shares
-//! no arithmetic with the runtime, so equal bytes are evidence. Every value is an integer held in an f64 and every
-//! operation on values is an f64 operation: integers below 2^53 and scaling by powers of two are exact there in any
-//! order, `floor(a/b)` and `floor(√x)` too (numerics, "Why f64 reproduces it").
+//! Written from the normative page on numerics and the formulas at the structs of [`firmware::program`] alone; it
+//! shares no arithmetic with the runtime, so equal bytes are evidence. Every value is an integer held in an f64 and
+//! every operation on values is an f64 operation: integers below 2^53 and scaling by powers of two are exact there in
+//! any order, `floor(a/b)` and `floor(√x)` too (numerics, "Why f64 reproduces it").
 //!
 //! That premise is checked, not assumed: each intermediate that could grow (accumulators, products, sums before a
 //! rounding shift) passes through an exactness watch, and a step where one reaches 2^53 fails as
@@ -45,9 +45,9 @@ use operands::{Operands, expect};
 
 /// Executes the whole model in the order of `model.steps`.
 ///
-/// `inputs` are codes in the order of `model.inputs` ([`encode_input`]); `observe` sees every step's index, the step and
-/// its output codes. Returns the codes of `model.outputs`, in order. A tensor is freed after the last step that reads
-/// it.
+/// `inputs` are codes in the order of `model.inputs` ([`encode_input`]); `observe` sees every step's index, the step
+/// and its output codes. Returns the codes of `model.outputs`, in order. A tensor is freed after the last step that
+/// reads it.
 ///
 /// # Errors
 /// [`ErrorCode::Malformed`] where the inputs, shapes and arrays of the model do not fit together or a tensor is read

@@ -1,7 +1,8 @@
 //! The float graph: what a network computes, before any integer is chosen.
 //!
 //! Invariants (checked by [`verify`], which collects every violation):
-//! * each node writes exactly one value, and reads only values written by earlier nodes (nodes are in topological order)
+//! * each node writes exactly one value, and reads only values written by earlier nodes (nodes are in topological
+//!   order)
 //! * activations are `height × width × channels`, batch 1, channel fastest; token matrices are `tokens × 1 × channels`
 //! * weights are `[output][kh][kw][input]` for convolutions and `[output][input]` for linear layers
 //! * every shape follows from the inputs' shapes and the operator ([`Op::output_shape`])

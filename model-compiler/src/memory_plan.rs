@@ -1,10 +1,11 @@
 //! Static memory plan: an offset in the arena for every tensor and scratch buffer, with a proof of how good it is.
 //!
-//! Items are chains of tensors that take over each other's memory, and one scratch buffer per step. A chain
-//! keeps one offset; at each step it is as large as its largest member live there, so a map that is pooled in place
-//! gives its tail back. A tensor is live from the step that writes it (inputs: from the start) to the last that reads it
-//! (outputs: to the end). No plan can be smaller than the largest sum of live bytes; the solver stops when it gets there,
-//! when its search is exhausted, or at a limit of search nodes. It never looks at a clock: same input, same plan.
+//! Items are chains of tensors that take over each other's memory, and one scratch buffer per step. A chain keeps one
+//! offset; at each step it is as large as its largest member live there, so a map that is pooled in place gives its
+//! tail back. A tensor is live from the step that writes it (inputs: from the start) to the last that reads it
+//! (outputs: to the end). No plan can be smaller than the largest sum of live bytes; the solver stops when it gets
+//! there, when its search is exhausted, or at a limit of search nodes. It never looks at a clock: same input, same
+//! plan.
 
 use crate::error::{Error, ErrorCode, Result};
 use crate::qmodel::QModel;

@@ -2,8 +2,8 @@
 //!
 //! The live bytes between two steps depend only on the set of steps done. So the orders are paths through the sets, and
 //! a set from which the end cannot be reached below a cap need not be visited again. The search lowers the cap until no
-//! order passes below it. A step that fits below the cap and does not raise the live bytes is taken without asking: done
-//! early it can only help the others. Among several steps the model's own order is tried first.
+//! order passes below it. A step that fits below the cap and does not raise the live bytes is taken without asking:
+//! done early it can only help the others. Among several steps the model's own order is tried first.
 
 use crate::memory_plan::MemoryNeeds;
 use std::collections::HashSet;

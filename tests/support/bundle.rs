@@ -1,7 +1,8 @@
-//! The bundled example: a small untrained TransFuser and procedural frames. Everything here is a pure function of seeds.
+//! The bundled example: a small untrained TransFuser and procedural frames. Everything here is a pure function of
+//! seeds.
 //!
-//! `cargo run --release -p tests --example make_bundle` writes it; `tests/demo.rs` checks that the stored files are what
-//! this module gives.
+//! `cargo run --release -p tests --example make_bundle` writes it; `tests/demo.rs` checks that the stored files are
+//! what this module gives.
 
 use crate::golden::{self, Network};
 use model_compiler::error::Result;

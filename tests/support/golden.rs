@@ -1,7 +1,8 @@
 //! Golden vectors of the published systems: checkpoints, frames, and what the original f32 networks gave for them.
 //!
 //! Weights are a pure function of tensor name and index (splitmix64), so they are generated instead of stored; only
-//! batch-norm statistics are stored, since made-up ones would ruin a deep network. Provenance: `tests/golden/README.md`.
+//! batch-norm statistics are stored, since made-up ones would ruin a deep network. Provenance:
+//! `tests/golden/README.md`.
 
 use model_compiler::import::{NamedTensor, NamedTensors, System, TensorData};
 use model_compiler::ir::{Graph, ValueId};

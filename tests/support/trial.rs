@@ -7,7 +7,8 @@ use firmware::tensor::TensorId;
 use host_sim::backends::{Backend, BackendKind};
 use model_compiler::emit::AlignedBytes;
 
-/// Accepted images beyond these limits are not run; `parse` bounds both, but not by what a test has time and memory for.
+/// Accepted images beyond these limits are not run; `parse` bounds both, but not by what a test has time and memory
+/// for.
 const MAX_WORK: u64 = 1 << 24;
 const MAX_ARENA: usize = 1 << 22;
 /// Largest arena alignment, and the size of the guards on both sides of the arena.

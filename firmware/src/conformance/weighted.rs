@@ -11,8 +11,8 @@ const OUTPUTS: [u16; 16] = [1, 2, 3, 4, 7, 8, 9, 15, 16, 17, 31, 33, 63, 64, 65,
 /// Depths from 1 to here follow each other.
 const DEPTHS: u32 = 130;
 
-/// A convolution: in turn one of 1×1 over each depth, a random window, a grouped one, and a deep one whose windows do not
-/// fit in a cache at once.
+/// A convolution: in turn one of 1×1 over each depth, a random window, a grouped one, and a deep one whose windows do
+/// not fit in a cache at once.
 pub(super) fn conv2d(case: &mut Case<'_>, number: u32) -> Outcome {
     let draw = &mut case.draw;
     let one = Window::square(1, 1, 0);

@@ -34,8 +34,8 @@ pub const fn weight_bytes(kernel: KernelId, groups: u16, outputs: u16, depth: u6
     }
 }
 
-/// Scratch of a convolution, bytes. [`KernelId::Direct`]: the windows of up to [`TILE_ROWS`] output pixels in one group,
-/// widened to `i16`. [`KernelId::K4N16`]: the same for as many tiles as fit the cache.
+/// Scratch of a convolution, bytes. [`KernelId::Direct`]: the windows of up to [`TILE_ROWS`] output pixels in one
+/// group, widened to `i16`. [`KernelId::K4N16`]: the same for as many tiles as fit the cache.
 pub const fn conv2d_scratch_bytes(kernel: KernelId, input: Shape, output: Shape, window: Window, groups: u16) -> u32 {
     if groups == 0 {
         return 0;
@@ -51,8 +51,8 @@ pub const fn conv2d_scratch_bytes(kernel: KernelId, input: Shape, output: Shape,
     }
 }
 
-/// Scratch of a linear layer, bytes. [`KernelId::Direct`]: [`TILE_ROWS`] rows of an `i8` input, widened to `i16`; none for
-/// `i16` input. [`KernelId::K4N16`]: as for a convolution.
+/// Scratch of a linear layer, bytes. [`KernelId::Direct`]: [`TILE_ROWS`] rows of an `i8` input, widened to `i16`; none
+/// for `i16` input. [`KernelId::K4N16`]: as for a convolution.
 pub const fn linear_scratch_bytes(kernel: KernelId, positions: u32, inputs: u16, input: ElementType) -> u32 {
     match (kernel, input) {
         (KernelId::Direct, ElementType::I8) => 2 * TILE_ROWS * inputs as u32,
@@ -61,8 +61,8 @@ pub const fn linear_scratch_bytes(kernel: KernelId, positions: u32, inputs: u16,
     }
 }
 
-/// Bytes from one row of `length` bytes in scratch to the next: an odd number of cache lines, so that the rows of a tile
-/// never compete for the same set of a cache.
+/// Bytes from one row of `length` bytes in scratch to the next: an odd number of cache lines, so that the rows of a
+/// tile never compete for the same set of a cache.
 pub const fn row_stride_bytes(length: u64) -> u64 {
     (length.div_ceil(64) | 1).saturating_mul(64)
 }
@@ -92,8 +92,8 @@ pub const fn waypoint_decoder_scratch_bytes(hidden_size: u16) -> u32 {
 /// Whether a max pool may write its output over the front of its input: in raster order no output element may land on
 /// an input element that a later output still reads.
 ///
-/// Output pixel `(y, x)` is written when `y·W_out + x` pixels have been; so its window must not begin before input pixel
-/// `y·W_out + x`. (An element may land on one that its own window reads: the kernel reads first.)
+/// Output pixel `(y, x)` is written when `y·W_out + x` pixels have been; so its window must not begin before input
+/// pixel `y·W_out + x`. (An element may land on one that its own window reads: the kernel reads first.)
 pub fn max_pool_in_place(input: Shape, output: Shape, window: Window) -> bool {
     if input.channels != output.channels || output.elements() > input.elements() {
         return false;

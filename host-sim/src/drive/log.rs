@@ -190,12 +190,12 @@ impl Description {
     }
 
     fn mounting(&self) -> Result<Mounting> {
-        let axes = match self.json.get("lidar_axes").map(Value::as_str) {
+        let axes = match self.json.get("lidar_axes").filter(|v| !v.is_null()).map(Value::as_str) {
             None | Some(Some("carla")) => Axes::Carla,
             Some(Some("velodyne")) => Axes::Velodyne,
             _ => return Err(self.bad("lidar_axes", "\"carla\" or \"velodyne\"")),
         };
-        let height = match self.json.get("lidar_height_m") {
+        let height = match self.json.get("lidar_height_m").filter(|v| !v.is_null()) {
             None => Some(TRAINED_HEIGHT),
             Some(height) => height.as_f64().and_then(I16F16::checked_from_num),
         };

@@ -53,8 +53,8 @@ pub fn heatmap(goal: [f64; 2], height: u16, width: u16) -> Vec<f32> {
     (0..i32::from(height)).flat_map(|y| (0..i32::from(width)).map(move |x| heat(x, y))).collect()
 }
 
-/// The views in a mirror: left and right change places, columns are reversed, those of the heatmap too (it is that of the
-/// mirrored goal, one column to the left: a map of even width has no middle column).
+/// The views in a mirror: left and right change places, columns are reversed, those of the heatmap too (it is that of
+/// the mirrored goal, one column to the left: a map of even width has no middle column).
 pub(super) fn mirrored(views: &RealMap) -> RealMap {
     let (pixel, row) = (usize::from(views.shape.channels), usize::from(views.shape.width));
     let mut data = Vec::with_capacity(views.data.len());

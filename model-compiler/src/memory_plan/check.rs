@@ -5,9 +5,9 @@ use super::needs::{scratch_bytes, scratch_room, tensor_bytes};
 use super::{MemoryPlan, Placement, PlanStatus, SCRATCH_ALIGNMENT};
 use crate::qmodel::{QModel, QTensorId};
 
-/// Verifies that a plan computes what the model computes: the order runs; live ranges, sizes and scratch are right; every
-/// in-place pair is legal; no two buffers that are live together overlap; everything is aligned and inside the arena; the
-/// bound and the status are true.
+/// Verifies that a plan computes what the model computes: the order runs; live ranges, sizes and scratch are right;
+/// every in-place pair is legal; no two buffers that are live together overlap; everything is aligned and inside the
+/// arena; the bound and the status are true.
 ///
 /// It does not prove that a plan of status [`PlanStatus::OptimalBoundNotReachable`] is optimal.
 ///

@@ -1,4 +1,5 @@
-//! Input normalization that another operator than a convolution reads, as a 1×1 convolution per channel of the raw image.
+//! Input normalization that another operator than a convolution reads, as a 1×1 convolution per channel of the raw
+//! image.
 
 use super::lower_batch_norm::per_channel;
 use crate::ir::{Conv2d, Graph, Op};

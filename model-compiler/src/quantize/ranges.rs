@@ -25,8 +25,8 @@ pub struct Quantization {
 }
 
 /// Clipping pulls every large value the same way, so its error adds up in the sums behind it; rounding errors average
-/// out. Found on the full-size TransFuser: with 1, 4, 16 the pooled vector reached 22.3, 20.3, 25.4 dB with 8-bit maps and
-/// 26.3, 27.2, 29.5 dB with 16-bit skip streams (range of the extremes: 21.6 and 28.3).
+/// out. Found on the full-size TransFuser: with 1, 4, 16 the pooled vector reached 22.3, 20.3, 25.4 dB with 8-bit maps
+/// and 26.3, 27.2, 29.5 dB with 16-bit skip streams (range of the extremes: 21.6 and 28.3).
 const CLIPPING_WEIGHT: f64 = 16.0;
 
 const CANDIDATES: u32 = 100;
@@ -66,7 +66,8 @@ impl Moments {
         (self.edges.partition_point(|&x| x < lo), self.edges.partition_point(|&x| x <= hi))
     }
 
-    /// Squared error of rounding to `steps` steps plus the weighted one of clipping to `[lo, hi]`; exact zeros cost nothing.
+    /// Squared error of rounding to `steps` steps plus the weighted one of clipping to `[lo, hi]`; exact zeros cost
+    /// nothing.
     fn error(&self, lo: f64, hi: f64, steps: f64) -> f64 {
         let (from, to) = self.inside(lo, hi);
         let step = (hi - lo) / steps;

@@ -40,8 +40,8 @@ impl Change<'_> {
     }
 }
 
-/// The value `target` where `elements` stand in the place of the changed value; `kept` holds every value of the unchanged
-/// network.
+/// The value `target` where `elements` stand in the place of the changed value; `kept` holds every value of the
+/// unchanged network.
 ///
 /// # Errors
 /// A value that is read was not kept.

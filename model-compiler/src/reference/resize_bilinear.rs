@@ -53,7 +53,8 @@ mod tests {
     use super::super::testing::assert_close;
     use super::*;
 
-    /// `torch.nn.functional.interpolate(x, scale_factor=…, mode="bilinear", align_corners=False)` of `[[1, 2], [3, 4]]`.
+    /// `torch.nn.functional.interpolate(x, scale_factor=…, mode="bilinear", align_corners=False)` of `[[1, 2], [3,
+    /// 4]]`.
     #[test]
     fn meets_hand_values_of_the_framework() {
         let map = [1.0, 2.0, 3.0, 4.0];

@@ -4,8 +4,8 @@ use super::VIEWS;
 use super::network::{List, plausible};
 use model_compiler::import::NamedTensors;
 
-/// Map `i` of the stored views `[N][9][H][W]`, and the heatmap that the original network saw beside it: `exp(−d²/50)` in a
-/// square of 11 pixels around column 40 + 50·i, row 120 − 20·i. `[H][W][10]`, grey levels.
+/// Map `i` of the stored views `[N][9][H][W]`, and the heatmap that the original network saw beside it: `exp(−d²/50)`
+/// in a square of 11 pixels around column 40 + 50·i, row 120 − 20·i. `[H][W][10]`, grey levels.
 pub(super) fn views(stored: &[u8], i: usize) -> Vec<f32> {
     let [height, width] = VIEWS;
     let planes = &stored[i * 9 * height * width..][..9 * height * width];

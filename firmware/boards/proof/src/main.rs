@@ -1,6 +1,6 @@
 //! Links only if no panic is reachable: the panic handler calls a symbol that nothing defines, so that one reachable
-//! panic is a link error. What is linked is what drives: parse, check, inference, self-test, waypoints, every sensor and
-//! the driver of all systems.
+//! panic is a link error. What is linked is what drives: parse, check, inference, self-test, waypoints, every sensor
+//! and the driver of all systems.
 //!
 //! The program is not meant to run. Each `twin-*` feature adds one panic of a usual kind at the end of a chain and must
 //! not link: so it shows, too, that the optimizer did not see the end of the chain as unreachable.

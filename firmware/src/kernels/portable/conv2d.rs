@@ -10,8 +10,8 @@ use crate::tensor::{CodesMut, Shape, index};
 /// `acc = b' + Σ w·q` over each window, then the epilogue.
 ///
 /// `input`: i8 map `H×W×C`; `output`: i8 or i16 map `OH×OW×O`, which may hold the residual; weights
-/// `[O][kh][kw][C/groups]` in [−127, 127], packed; padding is the padding code of its input channel. Products are exact in i32
-/// under the compiler's bound. `scratch`: [`crate::kernels::plan::conv2d_scratch_bytes`], aligned to 2 bytes.
+/// `[O][kh][kw][C/groups]` in [−127, 127], packed; padding is the padding code of its input channel. Products are exact
+/// in i32 under the compiler's bound. `scratch`: [`crate::kernels::plan::conv2d_scratch_bytes`], aligned to 2 bytes.
 pub fn conv2d(args: &Conv2dArgs<'_>, input: &[i8], output: CodesMut<'_>, scratch: &mut [u8]) {
     match output {
         CodesMut::I8(output) => run(args, input, output, scratch),

@@ -9,8 +9,8 @@ use crate::tensor::{Codes, CodesMut};
 
 /// `t = R(Σ wy·wx·(q − z), 2w − 8)` over four neighbors, `y = clamp(z_o + R(t·M + (r − z_r)·M_r, n))`.
 ///
-/// Input: i8 or i16 map `H×W×C`; output: i8 or i16 map `OH×OW×C`, which may hold the residual. `rows` and `columns`: per
-/// output line `[i0, w1]`, with `i1 = min(i0 + 1, last)` and weights `2^w − w1` and `w1`; w in 4..=11.
+/// Input: i8 or i16 map `H×W×C`; output: i8 or i16 map `OH×OW×C`, which may hold the residual. `rows` and `columns`:
+/// per output line `[i0, w1]`, with `i1 = min(i0 + 1, last)` and weights `2^w − w1` and `w1`; w in 4..=11.
 pub fn resize_bilinear(args: &ResizeArgs<'_>, output: CodesMut<'_>) {
     match (args.input.codes, output) {
         (Some(Codes::I8(input)), CodesMut::I8(output)) => run(args, input, output),

@@ -270,7 +270,8 @@ mod tests {
 
     #[test]
     fn opposite_halves_of_the_candidate_are_not_clamped_apart() {
-        // i = 40 and j = −40 in Q12 would both saturate at 8 if they were kept in 16 bits: tanh must see 0 to within r < 1.
+        // i = 40 and j = −40 in Q12 would both saturate at 8 if they were kept in 16 bits: tanh must see 0 to within r
+        // < 1.
         let table = Constants::random(&mut Rng(0), 1, 2).tanh;
         let args = WaypointDecoderArgs {
             hidden_size: 1,

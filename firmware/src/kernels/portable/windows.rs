@@ -37,8 +37,8 @@ impl<'a> Windows<'a> {
         self.rows.kernel() * self.columns.kernel() * self.group_channels
     }
 
-    /// Copies the window of output `(y, x)` in `group` into `row`, in the canonical order of the weights. `widen` copies
-    /// the front of a slice of codes to a slice of any element type.
+    /// Copies the window of output `(y, x)` in `group` into `row`, in the canonical order of the weights. `widen`
+    /// copies the front of a slice of codes to a slice of any element type.
     #[inline]
     pub(crate) fn gather<T: Copy + Default>(
         &self,

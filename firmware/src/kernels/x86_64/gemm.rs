@@ -1,9 +1,9 @@
-//! Convolution and linear layers over weights of [`KernelId::K4N16`](crate::program::KernelId::K4N16): an implicit matrix
-//! product, the same for every instruction set.
+//! Convolution and linear layers over weights of [`KernelId::K4N16`](crate::program::KernelId::K4N16): an implicit
+//! matrix product, the same for every instruction set.
 //!
-//! Scratch takes the windows of as many output positions as fit, one row each, copied once for all output channels. Then
-//! 64 output channels at a time meet all these rows, a tile of 6 rows after the other, so that their weights come from
-//! memory once and from the second-level cache after that.
+//! Scratch takes the windows of as many output positions as fit, one row each, copied once for all output channels.
+//! Then 64 output channels at a time meet all these rows, a tile of 6 rows after the other, so that their weights come
+//! from memory once and from the second-level cache after that.
 
 use super::super::k4n16::{OUTPUTS, Packed, QUAD, block_bytes};
 use super::super::plan::{PACKED_TILE_ROWS, row_stride_bytes};

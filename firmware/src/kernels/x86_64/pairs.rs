@@ -1,7 +1,8 @@
 //! Products of rows with a small matrix, both in 16 bits: the two matrix products of attention.
 //!
-//! The multiply-add instruction takes neighbors two by two: `(x_2p, x_2p+1) · (m_2p, m_2p+1)` for eight columns at once.
-//! So the matrix is packed in tiles of sixteen columns, pair after pair of its depth; a pair of a row is broadcast.
+//! The multiply-add instruction takes neighbors two by two: `(x_2p, x_2p+1) · (m_2p, m_2p+1)` for eight columns at
+//! once. So the matrix is packed in tiles of sixteen columns, pair after pair of its depth; a pair of a row is
+//! broadcast.
 
 use super::{Avx2, Avx512Vnni};
 use core::arch::x86_64::{__m256i, _mm256_add_epi32, _mm256_madd_epi16, _mm256_set1_epi32, _mm256_setzero_si256};

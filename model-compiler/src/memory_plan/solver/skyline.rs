@@ -1,10 +1,10 @@
 //! Exact search for a packing below a capacity: blocks are put down on a skyline, lowest level first.
 //!
-//! Each section has a *floor*: nothing unplaced may lie below it. A move either puts a block on a stretch of equal floor,
-//! or *closes* a section at the lowest level: nothing will start there, so its floor rises to the next level and the
-//! space between is lost. `slack = capacity − floor − (heights still to come)` is what a section may lose; where it is
-//! zero, a stretch between two walls must be filled exactly, so some block starts at its left end and some block ends at
-//! its right end. The corner with the fewest such blocks is branched on first.
+//! Each section has a *floor*: nothing unplaced may lie below it. A move either puts a block on a stretch of equal
+//! floor, or *closes* a section at the lowest level: nothing will start there, so its floor rises to the next level and
+//! the space between is lost. `slack = capacity − floor − (heights still to come)` is what a section may lose; where it
+//! is zero, a stretch between two walls must be filled exactly, so some block starts at its left end and some block
+//! ends at its right end. The corner with the fewest such blocks is branched on first.
 //!
 //! Only canonical packings are enumerated, those with the least sum of offsets: every block rests on another or on the
 //! ground, no unplaced block fits into a closed gap, stacked blocks of the same sections lie in order of size, and of

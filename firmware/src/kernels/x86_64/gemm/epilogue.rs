@@ -1,5 +1,5 @@
-//! From the sums of a tile to output codes, 16 channels at a time: [`crate::program::Rescale`] in loops over arrays that
-//! the compiler turns into the vector instructions of whoever inlines them.
+//! From the sums of a tile to output codes, 16 channels at a time: [`crate::program::Rescale`] in loops over arrays
+//! that the compiler turns into the vector instructions of whoever inlines them.
 //!
 //! Unlike the portable epilogue it holds `acc` and `R(acc, p)` in 32 bits. Under the compiler's bound on partial sums
 //! that is the same; beyond it both give numbers, not the same ones.
@@ -56,8 +56,8 @@ impl<'a> Epilogue<'a> {
         Some(Self { rescale, channels, outputs, blocks })
     }
 
-    /// Turns sums of positions from `first` on into the codes of `output`. Writes nothing where these or a residual are not
-    /// there.
+    /// Turns sums of positions from `first` on into the codes of `output`. Writes nothing where these or a residual are
+    /// not there.
     #[inline(always)]
     pub(super) fn finish<T: Code>(&self, sums: &[[i32; CHANNELS]], first: usize, output: &mut [T]) {
         let len = output.len();
@@ -88,8 +88,8 @@ impl<'a> Epilogue<'a> {
         }
     }
 
-    /// Stores what `codes` gives for every block of every position, clamped; it sees the block's constants and sums, and
-    /// where its codes lie in the output and what is stored there.
+    /// Stores what `codes` gives for every block of every position, clamped; it sees the block's constants and sums,
+    /// and where its codes lie in the output and what is stored there.
     #[inline(always)]
     fn each<T: Code>(
         &self,

@@ -56,8 +56,8 @@ fn matrix(t: &mut Translator<'_>, node: &Node<'_>, is_transposed: bool) -> Resul
     Ok(Floats { dims: vec![columns, rows], data })
 }
 
-/// A vector `1×K` gives a linear layer; a flattened map a convolution whose window is the whole map, with the weights in
-/// the map's order.
+/// A vector `1×K` gives a linear layer; a flattened map a convolution whose window is the whole map, with the weights
+/// in the map's order.
 fn push(
     t: &mut Translator<'_>,
     node: &Node<'_>,
