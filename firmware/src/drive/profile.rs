@@ -60,9 +60,8 @@ impl System {
             horizon: HORIZON,
             cadence: Cadence::EveryStep,
             substitute_heading: None,
-            limits: Limits::new(true, true),
+            limits: Limits::CAMERA_AND_LIDAR,
         };
-        let camera_only = Limits::new(false, true);
         match self {
             Self::TransFuser => Profile {
                 tuning: Tuning::TRANSFUSER,
@@ -71,12 +70,12 @@ impl System {
                 ..published
             },
             Self::LateFusion | Self::GeometricFusion => published,
-            Self::Aim => Profile { limits: camera_only, ..published },
-            Self::Cilrs => Profile { answer: Answer::Controls, limits: Limits::new(false, false), ..published },
+            Self::Aim => Profile { limits: Limits::CAMERA, ..published },
+            Self::Cilrs => Profile { answer: Answer::Controls, limits: Limits::CAMERA_WITHOUT_COMPASS, ..published },
             Self::Lbc => Profile {
                 answer: Answer::ImagePoints(Camera::LBC),
                 horizon: LBC_HORIZON,
-                limits: camera_only,
+                limits: Limits::CAMERA,
                 ..published
             },
         }
