@@ -4,7 +4,7 @@ use super::controller::Controller;
 use super::controls::Controls;
 use super::pose::{Point, Position, velocity_code};
 use super::profile::{Answer, Profile};
-use super::projection::Camera;
+use super::projection::GroundCamera;
 use super::route::{Command, Planner};
 use super::schedule::{Schedule, Turn};
 use super::supervision::{Counters, Fault, Limits, Reading, Sensor, Status, Supervisor};
@@ -17,13 +17,14 @@ use fixed::types::{I8F8, I16F16};
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Measurements {
     /// Whether there is an image; its pixels go to the network's input. [`Camera::finish`] says it of each camera
-    /// (`Reading::from`): missing rows are [`Reading::Missing`], a frozen image is [`Reading::Frozen`]. Of several cameras
-    /// the first that gave no value counts.
+    /// (`Reading::from`): missing rows are [`Reading::Missing`], a frozen image is [`Reading::Frozen`]. Of several
+    /// cameras the first that gave no value counts.
     ///
     /// [`Camera::finish`]: crate::sensors::camera::Camera::finish
     pub camera: Reading<()>,
-    /// Whether there is a sweep; its histogram goes to the network's input. [`Sweep::finish`] says it (`Reading::from`):
-    /// a sweep without a point is [`Reading::Missing`], one without a finite point [`Reading::NotANumber`].
+    /// Whether there is a sweep; its histogram goes to the network's input. [`Sweep::finish`] says it
+    /// (`Reading::from`): a sweep without a point is [`Reading::Missing`], one without a finite point
+    /// [`Reading::NotANumber`].
     ///
     /// [`Sweep::finish`]: crate::sensors::lidar::Sweep::finish
     pub lidar: Reading<()>,
@@ -156,8 +157,8 @@ impl<const N: usize> Pending<'_, N> {
 /// Every step ends with controls. A fault leads to the safe state at once: full brake, no throttle, the steering as it
 /// was last. There the controller forgets its errors and the last waypoints are dropped; after
 /// [`Limits::recovery_steps`] steps without a fault, in which the network runs and its answers are examined but not
-/// driven, the vehicle is driven again. In recovery too the network runs only where the [schedule](super::schedule) says:
-/// between those steps the sweep is not the one that it was trained with.
+/// driven, the vehicle is driven again. In recovery too the network runs only where the [schedule](super::schedule)
+/// says: between those steps the sweep is not the one that it was trained with.
 #[derive(Clone, Debug)]
 pub struct Driver<const N: usize = DEFAULT_ROUTE> {
     profile: Profile,
@@ -294,7 +295,8 @@ fn plan(answer: &Answer, limits: &Limits, output: NetworkOutput<'_>) -> Result<P
     let points = match (answer, output) {
         (Answer::Waypoints, NetworkOutput::Waypoints([first, second, ..])) => [*first, *second].map(Point::from),
         (Answer::ImagePoints(camera), NetworkOutput::ImagePoints([first, second, ..])) => {
-            let ground = |camera: &Camera, code| camera.ground(camera.image_point(code)).ok_or(Fault::InvalidOutput);
+            let ground =
+                |camera: &GroundCamera, code| camera.ground(camera.image_point(code)).ok_or(Fault::InvalidOutput);
             [ground(camera, *first)?, ground(camera, *second)?]
         }
         (Answer::Controls, NetworkOutput::Controls(logistic)) => {

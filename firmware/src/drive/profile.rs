@@ -2,7 +2,7 @@
 
 use super::Real;
 use super::controller::Tuning;
-use super::projection::Camera;
+use super::projection::GroundCamera;
 use super::route::Horizon;
 use super::schedule::Cadence;
 use super::supervision::Limits;
@@ -26,7 +26,7 @@ pub enum Answer {
     /// Waypoints in the vehicle's frame, for the controller.
     Waypoints,
     /// Points in the image of this camera; their ground points are the controller's waypoints.
-    ImagePoints(Camera),
+    ImagePoints(GroundCamera),
     /// Steer, throttle and brake themselves.
     Controls,
 }
@@ -73,7 +73,7 @@ impl System {
             Self::Aim => Profile { limits: Limits::CAMERA, ..published },
             Self::Cilrs => Profile { answer: Answer::Controls, limits: Limits::CAMERA_WITHOUT_COMPASS, ..published },
             Self::Lbc => Profile {
-                answer: Answer::ImagePoints(Camera::LBC),
+                answer: Answer::ImagePoints(GroundCamera::LBC),
                 horizon: LBC_HORIZON,
                 limits: Limits::CAMERA,
                 ..published

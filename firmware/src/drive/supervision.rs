@@ -187,9 +187,9 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// Camera, LiDAR and compass: two missed steps of a fast sensor and four of a slow one; an answer within its step; no
-    /// faster than 100 m/s, within 32 km of the map's origin, waypoints within the 128 m that the decoder can feed back;
-    /// half a second of recovery.
+    /// Camera, LiDAR and compass: two missed steps of a fast sensor and four of a slow one; an answer within its step;
+    /// no faster than 100 m/s, within 32 km of the map's origin, waypoints within the 128 m that the decoder can feed
+    /// back; half a second of recovery.
     pub const CAMERA_AND_LIDAR: Self = Self {
         camera_ms: FAST_MS,
         lidar_ms: Some(FAST_MS),

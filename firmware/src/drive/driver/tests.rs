@@ -342,7 +342,7 @@ proptest! {
                         forward: I16F16::from_bits(forward),
                     });
                     let own = match SYSTEMS[system] {
-                        System::Cilrs => NetworkOutput::Controls([codes[0][0], codes[0][1], codes[1][0]].map(|c| c as i16)),
+                        System::Cilrs => NetworkOutput::Controls([0, 1, 2].map(|k: usize| codes[k][0] as i16)),
                         System::Lbc => NetworkOutput::ImagePoints(&codes),
                         _ => NetworkOutput::Waypoints(&points),
                     };

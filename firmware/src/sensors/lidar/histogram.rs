@@ -1,7 +1,7 @@
 //! Points to a bird's-eye-view histogram: two channels (up to and above a height) of counts 0..=5.
 //!
-//! Rows are lateral: from 32 m on the right to 33 m on the left. Columns are longitudinal: from 32 m ahead (column 0) to
-//! the sensor (last column). Numbers of bins are powers of two; the published networks have 256 × 256 bins of
+//! Rows are lateral: from 32 m on the right to 33 m on the left. Columns are longitudinal: from 32 m ahead (column 0)
+//! to the sensor (last column). Numbers of bins are powers of two; the published networks have 256 × 256 bins of
 //! 65/256 m × 0.125 m. Bins are half-open, the last one of each axis is closed, and points outside are left out.
 
 use super::Point;
@@ -107,8 +107,8 @@ pub struct Statistics {
     pub saturated: u32,
 }
 
-/// A histogram that grows point by point in the network's input. A frame that ends before [`Self::finish`] leaves counts
-/// of the points so far.
+/// A histogram that grows point by point in the network's input. A frame that ends before [`Self::finish`] leaves
+/// counts of the points so far.
 #[derive(Debug)]
 pub struct Sweep<'a> {
     histogram: Histogram,

@@ -68,9 +68,9 @@ pub struct Pose {
 /// Brings a point of the frame of its capture into the current one: `p' = R·p + t` on the ground plane, z unchanged.
 ///
 /// With Δ = capture's compass − current compass and d = capture's position − current position:
-/// `left' = left·cos Δ − forward·sin Δ + t_left`, `forward' = left·sin Δ + forward·cos Δ + t_forward`, where t is d seen
-/// by the current frame. This is `M₂⁻¹·M₁·p` of the published data preparation in its axes (right, backward); there it
-/// was written for points whose x grows to the right. Networks of one LiDAR frame are trained without motion.
+/// `left' = left·cos Δ − forward·sin Δ + t_left`, `forward' = left·sin Δ + forward·cos Δ + t_forward`, where t is d
+/// seen by the current frame. This is `M₂⁻¹·M₁·p` of the published data preparation in its axes (right, backward);
+/// there it was written for points whose x grows to the right. Networks of one LiDAR frame are trained without motion.
 ///
 /// No motion is exact, and keeps the odd codes of [`Point`]. Otherwise a coordinate lies within 2^-14 m (61 µm) of the
 /// real one for points and motions of up to 128 m; results saturate at ±32768 m.
@@ -187,7 +187,8 @@ mod tests {
             forward in -128.0..128.0_f64,
         ) {
             let bits = [left as f32, forward as f32, 0.0].map(f32::to_bits);
-            let moved = Motion::between(&pose(first), &pose(second)).apply(super::super::Mounting::TRAINED.place(bits).unwrap());
+            let point = super::super::Mounting::TRAINED.place(bits).unwrap();
+            let moved = Motion::between(&pose(first), &pose(second)).apply(point);
             // The published axes: x to the right, y backward.
             let [x, y] = published(first, second, [-left, -forward]);
             let error = |found: I16F16, expected: f64| (found.to_num::<f64>() - expected).abs();
