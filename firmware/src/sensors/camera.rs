@@ -30,6 +30,7 @@
 //! ```
 
 use super::InputSize;
+use crate::drive::Reading;
 use crate::tensor::Shape;
 use core::fmt;
 
@@ -283,4 +284,16 @@ pub enum FrameStatus {
         /// Frames in a row that were equal to the one before.
         repeats: u16,
     },
+}
+
+/// What the driver is to know of a frame that ended in this step.
+impl From<Result<FrameStatus, MissingRows>> for Reading<()> {
+    fn from(frame: Result<FrameStatus, MissingRows>) -> Self {
+        match frame {
+            Ok(FrameStatus::Live) => Self::now(()),
+            Ok(FrameStatus::Frozen { .. }) => Self::Frozen,
+            // The input holds rows of several moments.
+            Err(MissingRows { .. }) => Self::Missing,
+        }
+    }
 }

@@ -2,7 +2,6 @@
 //! panic is a link error. What is linked is what drives: parse, check, inference, self-test, waypoints, every sensor and the
 //! driver of all systems.
 //!
-//!
 //! The program is not meant to run. Each `twin-*` feature adds one panic of a usual kind and must not link.
 #![no_std]
 #![no_main]

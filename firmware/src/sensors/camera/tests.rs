@@ -375,6 +375,13 @@ fn rows_of_one_crop_row_that_come_apart_are_missing() {
 }
 
 #[test]
+fn frames_become_readings_of_the_driver() {
+    assert_eq!(Reading::from(Ok(FrameStatus::Live)), Reading::now(()));
+    assert_eq!(Reading::from(Ok(FrameStatus::Frozen { repeats: 2 })), Reading::Frozen);
+    assert_eq!(Reading::from(Err(MissingRows { count: 1, first: 0 })), Reading::Missing);
+}
+
+#[test]
 fn a_refused_piece_leaves_the_sums_under_way() {
     let layout = CameraLayout { scale: Scale::Half, map: Shape::map(2, 2, 3), ..small(PixelFormat::Rgb) };
     let mut memory = vec![0; layout.memory_words()];
