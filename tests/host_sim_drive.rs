@@ -143,6 +143,14 @@ fn a_missing_sensor_stops_the_vehicle_until_it_has_recovered() {
 }
 
 #[test]
+fn a_sweep_without_points_stops_the_vehicle() {
+    let folder = project(System::LateFusion, |_, _| ());
+    folder.write("log/frames/0003/lidar.bin", []);
+    let status = &steps(&drive(&folder, ""))[3]["int8"]["status"];
+    assert_eq!(status, "LiDAR missing");
+}
+
+#[test]
 fn only_transfuser_drives_on_without_a_compass() {
     let blind = |step: usize, frame: &mut Value| {
         if step == 5 {
