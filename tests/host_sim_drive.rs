@@ -146,8 +146,8 @@ fn a_missing_sensor_stops_the_vehicle_until_it_has_recovered() {
 fn a_sweep_without_points_stops_the_vehicle() {
     let folder = project(System::LateFusion, |_, _| ());
     folder.write("log/frames/0003/lidar.bin", []);
-    let status = &steps(&drive(&folder, ""))[3]["int8"]["status"];
-    assert_eq!(status, "LiDAR missing");
+    let document = drive(&folder, "");
+    assert_eq!(steps(&document)[3]["int8"]["status"], "LiDAR missing");
 }
 
 #[test]
