@@ -146,7 +146,7 @@ fn next_node_command_and_goal_are_those_of_the_original_planner() {
         if let Step::Network(pending) = driver.step(&measurements) {
             check(pending.inputs().goal.map(|x| x.to_num()));
             assert_eq!(pending.inputs().command, node.command, "step {index}");
-            pending.finish(Ok(NetworkOutput::Waypoints(&[Waypoint::default(); 4])));
+            pending.finish(Ok(NetworkOutput::Waypoints(&[Waypoint::default(); 4])), 0);
         } else {
             assert_eq!(index, 0, "the network runs every step but the first");
         }
@@ -217,7 +217,7 @@ fn waypoint_systems_drive_as_the_formulas_say() {
                     points = [0, 1].map(|k: usize| [codes[k][0], -codes[k][1]].map(|x| f64::from(x) / 65536.0));
                     let bytes: Vec<u8> = codes.iter().flatten().flat_map(|code| code.to_le_bytes()).collect();
                     let waypoints = waypoint::read(&bytes).expect("four waypoints");
-                    pending.finish(Ok(NetworkOutput::Waypoints(&waypoints)))
+                    pending.finish(Ok(NetworkOutput::Waypoints(&waypoints)), 0)
                 }
                 Step::Done(output) => output,
             };
@@ -247,7 +247,7 @@ fn lbc_drives_as_the_formulas_say() {
             [(x - 128.0) * depth / 140.8, depth - 0.4]
         });
         let Step::Network(pending) = driver.step(&measured(speed)) else { panic!("the network runs every step") };
-        let output = pending.finish(Ok(NetworkOutput::ImagePoints(&codes)));
+        let output = pending.finish(Ok(NetworkOutput::ImagePoints(&codes)), 0);
         assert_eq!(output.status, Status::Driving, "seed {seed}, step {index}: {points:?}");
         worst.compare(&format!("seed {seed}, step {index}"), output.controls, agent.step(points, speed));
     }
@@ -264,7 +264,7 @@ fn cilrs_drives_as_the_formulas_say() {
         let [s0, s1, s2] = codes.map(|code| f64::from(code) / 32768.0);
         let brake = if s2 < 0.05 || 0.75 * s1 > s2 { 0.0 } else { s2 };
         let Step::Network(pending) = driver.step(&measured(3.0)) else { panic!("the network runs every step") };
-        let Controls { steer, throttle, brake: found } = pending.finish(Ok(NetworkOutput::Controls(codes))).controls;
+        let Controls { steer, throttle, brake: found } = pending.finish(Ok(NetworkOutput::Controls(codes)), 0).controls;
         let found: [f64; 3] = [steer, throttle, found].map(|x| x.to_num());
         let expected = [2.0 * s0 - 1.0, 0.75 * s1, brake];
         let close = found.iter().zip(expected).all(|(f, e)| (f - e).abs() < 1e-9);

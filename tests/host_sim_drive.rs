@@ -246,6 +246,14 @@ fn a_missing_sensor_stops_the_vehicle_until_it_has_recovered() {
 }
 
 #[test]
+fn a_sweep_without_points_stops_the_vehicle() {
+    let folder = project(System::LateFusion, |_, _| ());
+    folder.write("log/frames/0003/lidar.bin", []);
+    let document = drive(&folder, "");
+    assert_eq!(steps(&document)[3]["int8"]["status"], "LiDAR missing");
+}
+
+#[test]
 fn only_transfuser_drives_on_without_a_compass() {
     let blind = |step: usize, frame: &mut Value| {
         if step == 5 {

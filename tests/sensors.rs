@@ -1,8 +1,8 @@
-//! From what sensors give to the codes that networks read: the runtime's integers against the host's preparation in f64,
-//! and against what the networks' own preparation gave.
+//! From what sensors give to the codes that networks read: the runtime's integers against the host's preparation in
+//! f64, and against what the networks' own preparation gave.
 
 use firmware::sensors::NotFinite;
-use firmware::sensors::camera::{Camera, CameraLayout, PixelFormat, Scale, Status};
+use firmware::sensors::camera::{Camera, CameraLayout, FrameStatus, PixelFormat, Scale};
 use firmware::sensors::correspondences::{CELLS, Correspondences, ELEMENTS, ENTRIES, Intrinsics};
 use firmware::sensors::heatmap;
 use firmware::sensors::inputs;
@@ -214,7 +214,7 @@ fn capture(layout: CameraLayout, bytes: &[u8], stride: u32) -> Vec<i8> {
     let mut input = vec![0; layout.map.elements() as usize];
     let mut camera = Camera::new(layout, &mut memory).unwrap();
     camera.push_image(bytes, stride, &mut input).unwrap();
-    assert_eq!(camera.finish(), Ok(Status::Live));
+    assert_eq!(camera.finish(), Ok(FrameStatus::Live));
     input
 }
 
@@ -314,7 +314,7 @@ fn three_cameras_and_a_goal_fill_the_map_of_lbc() {
         let mut memory = vec![0; layout.memory_words()];
         let mut camera = Camera::new(layout, &mut memory).unwrap();
         camera.push_image(&bgra, 256 * 4, &mut input).unwrap();
-        assert_eq!(camera.finish(), Ok(Status::Live));
+        assert_eq!(camera.finish(), Ok(FrameStatus::Live));
     }
     heatmap::draw(inputs::goal(target).unwrap(), &mut input).unwrap();
     // 0.5 m to the right and 20 m ahead: pixel (130.75, 146), clamped to the last row.

@@ -62,7 +62,7 @@ fn driver(criterion: &mut Criterion) {
     let waypoints = [Waypoint::default(); 4];
     criterion.bench_function("driver step", |bench| {
         bench.iter(|| match driver.step(black_box(&measurements)) {
-            Step::Network(pending) => pending.finish(Ok(NetworkOutput::Waypoints(&waypoints))),
+            Step::Network(pending) => pending.finish(Ok(NetworkOutput::Waypoints(&waypoints)), 0),
             Step::Done(output) => output,
         });
     });

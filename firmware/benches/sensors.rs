@@ -1,7 +1,7 @@
 //! Time of the sensor layer: camera rows in every format, LiDAR points, the heatmap.
 //!
-//! `cargo bench -p firmware --bench sensors` measures all, with `-- camera` some of them, and with `-- --test` runs each
-//! once. Throughput counts rows of the crop for cameras, points for LiDAR, and heatmaps.
+//! `cargo bench -p firmware --bench sensors` measures all, with `-- camera` some of them, and with `-- --test` runs
+//! each once. Throughput counts rows of the crop for cameras, points for LiDAR, and heatmaps.
 
 use criterion::{BenchmarkId, Criterion, Throughput};
 use firmware::image::known_answer::Generator;

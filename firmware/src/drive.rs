@@ -18,11 +18,12 @@
 //!     compass: Reading::now(Real::from_num(0.1)),
 //! };
 //! # let infer = |goal: [u8; 8], velocity: [u8; 2]| [Waypoint::default(); 4];
+//! # let elapsed_ms = || 31;
 //! let Output { controls, status } = match driver.step(&measurements) {
 //!     Step::Network(pending) => {
 //!         let inputs = pending.inputs();
 //!         let waypoints = infer(inputs.goal_bytes(), inputs.velocity_bytes()); // start, step, …, waypoints
-//!         pending.finish(Ok(NetworkOutput::Waypoints(&waypoints)))
+//!         pending.finish(Ok(NetworkOutput::Waypoints(&waypoints)), elapsed_ms())
 //!     }
 //!     Step::Done(output) => output,
 //! };

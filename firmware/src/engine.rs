@@ -243,7 +243,8 @@ impl<'a, K: Kernels> Engine<'a, K> {
     /// The waypoints of an output, after [`Progress::Done`].
     ///
     /// # Errors
-    /// As [`Self::output`]; [`EngineError::NoWaypoints`] where the output holds something else than pairs of Q16 meters.
+    /// As [`Self::output`]; [`EngineError::NoWaypoints`] where the output holds something else than pairs of Q16
+    /// meters.
     pub fn waypoints(&self, output: usize) -> Result<heapless::Vec<Waypoint, MAX_WAYPOINTS>, EngineError> {
         let bytes = self.output(output)?;
         let number = u8::try_from(output).unwrap_or(u8::MAX);

@@ -253,8 +253,8 @@ pub struct Requantize {
 
 /// Bilinear enlargement by a whole factor with half-pixel centers, optionally added to a map of the output's size.
 ///
-/// Per axis, output index d reads rows `i0(d)`, `i1 = min(i0+1, last)` with weights `2^w − w1(d)` and `w1(d)`, stored in
-/// `rows` / `columns` as pairs `(i0: u16, w1: u16)`. `t = R(Σ wy·wx·(q − z), 2w − 8)` (1/256 of the input LSB);
+/// Per axis, output index d reads rows `i0(d)`, `i1 = min(i0+1, last)` with weights `2^w − w1(d)` and `w1(d)`, stored
+/// in `rows` / `columns` as pairs `(i0: u16, w1: u16)`. `t = R(Σ wy·wx·(q − z), 2w − 8)` (1/256 of the input LSB);
 /// `y = clamp(z_o + R(t·M + (r − z_r)·M_r, n))`.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ResizeBilinear {
@@ -539,7 +539,7 @@ pub struct BranchLinear {
     pub command: TensorId,
     /// i8 or i16, `positions × O`.
     pub output: TensorId,
-    /// B, at least 1.
+    /// B, 1..=127: as many as an i8 command can name.
     pub branches: u16,
     /// Packing of each block.
     pub kernel: KernelId,

@@ -15,9 +15,9 @@ use crate::files::{self, ImageFile};
 use crate::points::PixelGrid;
 use crate::run::{ModelInfo, Waypoints};
 use crate::system;
-use firmware::drive::{Driver, NetworkInputs, Output, Reading, RouteNode, Status, Step};
+use firmware::drive::{Driver, Measurements, NetworkInputs, Output, Reading, RouteNode, Status, Step};
 use indicatif::ProgressBar;
-use log::{Log, LoggedFrame};
+use log::Log;
 use model_compiler::artifact;
 use model_compiler::error::Result;
 use model_compiler::import::ImportOptions;
@@ -133,7 +133,7 @@ impl Seat<'_> {
     /// One step; `infer` runs the network where it is asked for.
     fn step(
         &mut self,
-        frame: &LoggedFrame,
+        measurements: &Measurements,
         infer: impl FnOnce(&NetworkInputs) -> Result<Answer>,
     ) -> Result<(Decision, Option<NetworkInputs>)> {
         while let [node, rest @ ..] = self.ahead {
@@ -142,12 +142,14 @@ impl Seat<'_> {
             }
             self.ahead = rest;
         }
-        match self.driver.step(&frame.measurements) {
+        match self.driver.step(measurements) {
             Step::Done(output) => Ok((Decision::new(output, None), None)),
             Step::Network(pending) => {
                 let inputs = *pending.inputs();
                 let answer = infer(&inputs)?;
-                Ok((Decision::new(pending.finish(answer.output()), Some(&answer)), Some(inputs)))
+                // The time that this machine takes says nothing about the vehicle's.
+                let output = pending.finish(answer.output(), 0);
+                Ok((Decision::new(output, Some(&answer)), Some(inputs)))
             }
         }
     }
@@ -180,11 +182,12 @@ pub fn drive(options: &Options, progress: &ProgressBar) -> Result<DriveReport> {
     for (index, frame) in log.frames.iter().enumerate() {
         progress.set_message(frame.name.clone());
         let within = |e: model_compiler::error::Error| e.within(format!("step {}", frame.name));
-        let infer = |inputs: &NetworkInputs| integers.infer(&rig.inputs(frame, inputs)?);
-        let (int8, inputs) = first.step(frame, infer).map_err(within)?;
+        let sensed = rig.sense(frame).map_err(within)?;
+        let infer = |inputs: &NetworkInputs| integers.infer(&sensed.inputs(inputs)?);
+        let (int8, inputs) = first.step(&sensed.measurements, infer).map_err(within)?;
         let beside = float.as_ref().map(|network| {
-            let infer = |inputs: &NetworkInputs| network.infer(&rig, &rig.inputs(frame, inputs)?, &image);
-            second.step(frame, infer).map(|(decision, _)| decision).map_err(within)
+            let infer = |inputs: &NetworkInputs| network.infer(&rig, &sensed.inputs(inputs)?, &image);
+            second.step(&sensed.measurements, infer).map(|(decision, _)| decision).map_err(within)
         });
         let beside = beside.transpose()?;
         steps.push(DriveStep {

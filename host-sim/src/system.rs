@@ -51,7 +51,7 @@ pub fn profile(system: System, maps: Option<PixelGrid>) -> Profile {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use firmware::drive::projection::Camera;
+    use firmware::drive::projection::GroundCamera;
     use firmware::tensor::Shape;
 
     #[test]
@@ -75,7 +75,7 @@ mod tests {
     #[test]
     fn smaller_maps_are_the_middle_of_the_same_camera() {
         let maps = PixelGrid::of_shape(Shape::map(48, 64, 4));
-        let expected = Camera { size: [64, 48], ..Camera::LBC };
+        let expected = GroundCamera { size: [64, 48], ..GroundCamera::LBC };
         assert_eq!(profile(System::Lbc, Some(maps)).answer, Answer::ImagePoints(expected));
         assert_eq!(profile(System::Lbc, None), System::Lbc.profile());
         assert_eq!(profile(System::Aim, Some(maps)), System::Aim.profile());

@@ -478,6 +478,7 @@ fn operator_changes() -> Vec<(Check, Change)> {
         (Check::StepMultiplier, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.requant.multiplier = 1 << 24))),
         (Check::StepShift, Parts(|p| step!(p, at::GATHER_SUM, GatherSum, |s| s.requant.shift = 0))),
         (Check::StepBranches, Parts(|p| step!(p, at::BRANCH_LINEAR, BranchLinear, |s| s.branches = 0))),
+        (Check::StepBranches, Parts(|p| step!(p, at::BRANCH_LINEAR, BranchLinear, |s| s.branches = 128))),
         (
             Check::StepResidual,
             Parts(|p| {

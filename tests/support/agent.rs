@@ -94,7 +94,7 @@ pub fn ground([x, y]: [f64; 2]) -> Option<[f64; 2]> {
 /// The route is empty.
 pub fn next_node<T: Copy>(route: &mut VecDeque<([f64; 2], T)>, own: [f64; 2], reach: f64, look_ahead: f64) -> T {
     let distance = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).hypot(a[1] - b[1]);
-    let (mut passed, mut farthest, mut travel) = (0, 0.0, 0.0);
+    let (mut passed, mut farthest, mut travel) = (0, f64::NEG_INFINITY, 0.0);
     for index in 1..route.len() {
         if travel > look_ahead {
             break;

@@ -1,5 +1,5 @@
-//! Operators on tokens, the softmaxes, the sigmoid and the waypoint decoder. Tables fall and rise like the functions that
-//! they stand for, but are straight lines: a backend must read them, not know them.
+//! Operators on tokens, the softmaxes, the sigmoid and the waypoint decoder. Tables fall and rise like the functions
+//! that they stand for, but are straight lines: a backend must read them, not know them.
 
 use super::draw::Draw;
 use super::{Case, Difference, Outcome, first_difference};

@@ -46,7 +46,9 @@ impl Tuning {
 /// With w₁, w₂ the first two waypoints (half a second apart; the others say nothing to the controller) and v the speed:
 /// * wanted speed `d = 2·|w₁ − w₂|`
 /// * `brake = d < brake_speed or v > brake_ratio·d`
-/// * angle from the mean of w₁ and w₂, `1 − 2/π·atan2(forward, right)`: 0 ahead, 1 to the right, up to 3 behind
+/// * angle from the mean of w₁ and w₂, `1 − 2/π·atan2(forward, right)`, in [−1, 3]: 0 ahead, 1 to the right, 2 behind;
+///   straight to the left it jumps from −1 to 3, so that a point behind on the left steers to the right. Where the mean
+///   is the vehicle itself, which gives no direction, it is 1: full right
 /// * `steer = clamp(PID(angle), −1, 1)`
 /// * `throttle = clamp(PID(clamp(d − v, 0, max_speed_error)), 0, max_throttle)`, 0 while braking
 ///

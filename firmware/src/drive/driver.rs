@@ -4,7 +4,7 @@ use super::controller::Controller;
 use super::controls::Controls;
 use super::pose::{Point, Position, velocity_code};
 use super::profile::{Answer, Profile};
-use super::projection::Camera;
+use super::projection::GroundCamera;
 use super::route::{Command, Planner};
 use super::schedule::{Schedule, Turn};
 use super::supervision::{Counters, Fault, Limits, Reading, Sensor, Status, Supervisor};
@@ -16,9 +16,17 @@ use fixed::types::{I8F8, I16F16};
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Measurements {
-    /// Whether there is an image; its pixels go to the network's input.
+    /// Whether there is an image; its pixels go to the network's input. [`Camera::finish`] says it of each camera
+    /// (`Reading::from`): missing rows are [`Reading::Missing`], a frozen image is [`Reading::Frozen`]. Of several
+    /// cameras the first that gave no value counts.
+    ///
+    /// [`Camera::finish`]: crate::sensors::camera::Camera::finish
     pub camera: Reading<()>,
-    /// Whether there is a sweep; its histogram goes to the network's input.
+    /// Whether there is a sweep; its histogram goes to the network's input. [`Sweep::finish`] says it
+    /// (`Reading::from`): a sweep without a point is [`Reading::Missing`], one without a finite point
+    /// [`Reading::NotANumber`].
+    ///
+    /// [`Sweep::finish`]: crate::sensors::lidar::Sweep::finish
     pub lidar: Reading<()>,
     /// Forward speed, m/s; negative when reversing.
     pub speed: Reading<Real>,
@@ -76,7 +84,7 @@ pub enum NetworkOutput<'a> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum NetworkError {
-    /// It was not done in time.
+    /// It was given up because it was not done in time.
     Overrun,
     /// The engine refused.
     Failed,
@@ -132,11 +140,16 @@ impl<const N: usize> Pending<'_, N> {
         &self.inputs
     }
 
-    /// Ends the step with what the network gave.
-    pub fn finish(self, output: Result<NetworkOutput<'_>, NetworkError>) -> Output {
+    /// Ends the step with what the network gave, `elapsed_ms` after the step began. An answer later than
+    /// [`Limits::network_ms`] is not driven: the measurements that it is made of are past.
+    ///
+    /// Nothing here runs while the network does. A network that never ends leaves the actuators as the step before set
+    /// them, so they need a watchdog of their own, which brakes when no controls have come for a few steps.
+    pub fn finish(self, output: Result<NetworkOutput<'_>, NetworkError>, elapsed_ms: u16) -> Output {
         let Self { driver, speed, .. } = self;
         driver.awaiting = false;
         let plan = match output {
+            Ok(_) if elapsed_ms > driver.profile.limits.network_ms => Err(Fault::NetworkOverrun),
             Ok(output) => plan(&driver.profile.answer, &driver.profile.limits, output),
             Err(NetworkError::Overrun) => Err(Fault::NetworkOverrun),
             Err(NetworkError::Failed) => Err(Fault::NetworkFailed),
@@ -153,7 +166,8 @@ impl<const N: usize> Pending<'_, N> {
 /// Every step ends with controls. A fault leads to the safe state at once: full brake, no throttle, the steering as it
 /// was last. There the controller forgets its errors and the last waypoints are dropped; after
 /// [`Limits::recovery_steps`] steps without a fault, in which the network runs and its answers are examined but not
-/// driven, the vehicle is driven again.
+/// driven, the vehicle is driven again. In recovery too the network runs only where the [schedule](super::schedule)
+/// says: between those steps the sweep is not the one that it was trained with.
 #[derive(Clone, Debug)]
 pub struct Driver<const N: usize = DEFAULT_ROUTE> {
     profile: Profile,
@@ -193,7 +207,8 @@ impl<const N: usize> Driver<N> {
         &self.counters
     }
 
-    /// Begins the next step.
+    /// Begins the next step. The schedule counts the ticks of the vehicle's clock, which the LiDAR turns by: call this
+    /// once per tick of [`STEP_MS`](super::schedule::STEP_MS), and [`Self::skip`] for a tick that went by without it.
     pub fn step(&mut self, measurements: &Measurements) -> Step<'_, N> {
         self.counters.steps = self.counters.steps.saturating_add(1);
         let turn = self.schedule.advance();
@@ -207,7 +222,11 @@ impl<const N: usize> Driver<N> {
         match (turn, self.plan) {
             (Turn::Fill, _) => Step::Done(Output { controls: Controls::ZERO, status: Status::Filling }),
             (Turn::Reuse, Some(plan)) => Step::Done(self.drive(plan, speed)),
-            _ => {
+            (Turn::Reuse, None) => {
+                self.supervisor.pass();
+                Step::Done(self.safe(Status::Recovering))
+            }
+            (Turn::Network, _) => {
                 self.counters.network_runs = self.counters.network_runs.saturating_add(1);
                 self.awaiting = true;
                 Step::Network(Pending { driver: self, inputs, speed })
@@ -215,27 +234,36 @@ impl<const N: usize> Driver<N> {
         }
     }
 
+    /// Passes a tick in which no step was possible, for instance because the network of the step before was still
+    /// running. No waypoints from before it are driven on: if it was the network's turn, the vehicle brakes until the
+    /// next one.
+    pub fn skip(&mut self) {
+        self.counters.skipped = self.counters.skipped.saturating_add(1);
+        self.schedule.advance();
+        self.plan = None;
+    }
+
     /// Checks the measurements and follows the route: inputs of the network and the speed.
     fn sense(&mut self, measurements: &Measurements) -> Result<(NetworkInputs, Real), Fault> {
         let Measurements { camera, lidar, speed, position, compass } = *measurements;
-        let Limits { speed: fastest, position: farthest, .. } = self.profile.limits;
-        let limits = &self.profile.limits;
-        limits.check(Sensor::Camera, camera)?;
-        limits.check(Sensor::Lidar, lidar)?;
-        let speed = limits.check(Sensor::Speed, speed)?.unwrap_or(Real::ZERO);
-        if !within(fastest, speed) {
+        let limits = self.profile.limits;
+        camera.recent(Sensor::Camera, limits.camera_ms)?;
+        limits.lidar_ms.map_or(Ok(()), |limit_ms| lidar.recent(Sensor::Lidar, limit_ms))?;
+        let speed = speed.recent(Sensor::Speed, limits.speed_ms)?;
+        if !within(limits.speed, speed) {
             return Err(Fault::Invalid(Sensor::Speed));
         }
-        let own = limits.check(Sensor::Position, position)?.unwrap_or_default();
-        if !(within(farthest, own.north) && within(farthest, own.east)) {
+        let own = position.recent(Sensor::Position, limits.position_ms)?;
+        if !(within(limits.position, own.north) && within(limits.position, own.east)) {
             return Err(Fault::Invalid(Sensor::Position));
         }
-        let heading = match (compass, self.profile.substitute_heading) {
-            (Reading::NotANumber, Some(substitute)) => {
+        let heading = match (limits.compass_ms, compass, self.profile.substitute_heading) {
+            (None, _, _) => Real::ZERO,
+            (Some(_), Reading::NotANumber, Some(substitute)) => {
                 self.counters.substituted_headings = self.counters.substituted_headings.saturating_add(1);
                 substitute
             }
-            _ => limits.check(Sensor::Compass, compass)?.unwrap_or(Real::ZERO),
+            (Some(limit_ms), _, _) => compass.recent(Sensor::Compass, limit_ms)?,
         };
         let node = self.planner.advance(own).ok_or(Fault::NoRoute)?;
         let goal = Point::seen_from(own, heading, node.position).goal_codes();
@@ -286,7 +314,8 @@ fn plan(answer: &Answer, limits: &Limits, output: NetworkOutput<'_>) -> Result<P
     let points = match (answer, output) {
         (Answer::Waypoints, NetworkOutput::Waypoints([first, second, ..])) => [*first, *second].map(Point::from),
         (Answer::ImagePoints(camera), NetworkOutput::ImagePoints([first, second, ..])) => {
-            let ground = |camera: &Camera, code| camera.ground(camera.image_point(code)).ok_or(Fault::InvalidOutput);
+            let ground =
+                |camera: &GroundCamera, code| camera.ground(camera.image_point(code)).ok_or(Fault::InvalidOutput);
             [ground(camera, *first)?, ground(camera, *second)?]
         }
         (Answer::Controls, NetworkOutput::Controls(logistic)) => {

@@ -26,9 +26,9 @@ impl Position {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct GpsPlane {
     /// Latitude of the origin, in 10⁻⁹ degrees.
-    pub latitude: i64,
+    pub latitude_nanodegrees: i64,
     /// Longitude of the origin, in 10⁻⁹ degrees.
-    pub longitude: i64,
+    pub longitude_nanodegrees: i64,
     /// Meters per degree of latitude.
     pub north_per_degree: Real,
     /// Meters per degree of longitude.
@@ -38,30 +38,30 @@ pub struct GpsPlane {
 impl GpsPlane {
     /// The simulator CARLA from 0.9.10 on, whose maps lie around the equator.
     pub const CARLA: Self = Self {
-        latitude: 0,
-        longitude: 0,
+        latitude_nanodegrees: 0,
+        longitude_nanodegrees: 0,
         north_per_degree: Real::lit("111324.60662786"),
         east_per_degree: Real::lit("111319.490945"),
     };
     /// CARLA before 0.9.10, whose maps lie around 49° north, 8° east.
     pub const CARLA_0_9_9: Self = Self {
-        latitude: 49_000_000_000,
-        longitude: 8_000_000_000,
+        latitude_nanodegrees: 49_000_000_000,
+        longitude_nanodegrees: 8_000_000_000,
         north_per_degree: Real::lit("111324.60662786"),
         east_per_degree: Real::lit("73032.1570362"),
     };
 
     /// The place of a latitude and a longitude, both in 10⁻⁹ degrees (0.1 mm), rounded toward the origin. What no
     /// receiver says saturates.
-    pub fn position(&self, latitude: i64, longitude: i64) -> Position {
+    pub fn position(&self, latitude_nanodegrees: i64, longitude_nanodegrees: i64) -> Position {
         let meters = |from: i64, to: i64, per_degree: Real| {
             let product = i128::from(to).saturating_sub(from.into()).saturating_mul(per_degree.to_bits().into());
             let bits = product / 1_000_000_000;
             Real::from_bits(i64::try_from(bits).unwrap_or(if bits < 0 { i64::MIN } else { i64::MAX }))
         };
         Position {
-            north: meters(self.latitude, latitude, self.north_per_degree),
-            east: meters(self.longitude, longitude, self.east_per_degree),
+            north: meters(self.latitude_nanodegrees, latitude_nanodegrees, self.north_per_degree),
+            east: meters(self.longitude_nanodegrees, longitude_nanodegrees, self.east_per_degree),
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use super::Real;
 use super::controller::Tuning;
-use super::projection::Camera;
+use super::projection::GroundCamera;
 use super::route::Horizon;
 use super::schedule::Cadence;
 use super::supervision::Limits;
@@ -26,7 +26,7 @@ pub enum Answer {
     /// Waypoints in the vehicle's frame, for the controller.
     Waypoints,
     /// Points in the image of this camera; their ground points are the controller's waypoints.
-    ImagePoints(Camera),
+    ImagePoints(GroundCamera),
     /// Steer, throttle and brake themselves.
     Controls,
 }
@@ -60,9 +60,8 @@ impl System {
             horizon: HORIZON,
             cadence: Cadence::EveryStep,
             substitute_heading: None,
-            limits: Limits::new(true, true),
+            limits: Limits::CAMERA_AND_LIDAR,
         };
-        let camera_only = Limits::new(false, true);
         match self {
             Self::TransFuser => Profile {
                 tuning: Tuning::TRANSFUSER,
@@ -71,12 +70,12 @@ impl System {
                 ..published
             },
             Self::LateFusion | Self::GeometricFusion => published,
-            Self::Aim => Profile { limits: camera_only, ..published },
-            Self::Cilrs => Profile { answer: Answer::Controls, limits: Limits::new(false, false), ..published },
+            Self::Aim => Profile { limits: Limits::CAMERA, ..published },
+            Self::Cilrs => Profile { answer: Answer::Controls, limits: Limits::CAMERA_WITHOUT_COMPASS, ..published },
             Self::Lbc => Profile {
-                answer: Answer::ImagePoints(Camera::LBC),
+                answer: Answer::ImagePoints(GroundCamera::LBC),
                 horizon: LBC_HORIZON,
-                limits: camera_only,
+                limits: Limits::CAMERA,
                 ..published
             },
         }

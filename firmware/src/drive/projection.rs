@@ -15,7 +15,7 @@ pub struct ImagePoint {
 
 /// A camera that looks straight ahead over flat ground.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Camera {
+pub struct GroundCamera {
     /// Columns and rows of the image.
     pub size: [u16; 2],
     /// Focal lengths to the right and down, in pixels.
@@ -26,7 +26,7 @@ pub struct Camera {
     pub setback: Real,
 }
 
-impl Camera {
+impl GroundCamera {
     /// LBC's front camera, as its controller sees it: a field of view of 90°, columns 1.1 times as dense.
     pub const LBC: Self = Self {
         size: [256, 144],
@@ -75,10 +75,10 @@ mod tests {
     fn ground_is_the_pinhole_formula() {
         for column in (0..=255).step_by(5) {
             for row in 0..144 {
-                let point = Camera::LBC.image_point([column * 64 + 13, row * 64 + 7]);
+                let point = GroundCamera::LBC.image_point([column * 64 + 13, row * 64 + 7]);
                 let [x, y] = [f64::from(column * 64 + 13) / 64.0, f64::from(row * 64 + 7) / 64.0];
                 let [u, v] = [x / 255.0 * 256.0 - 128.0, y / 143.0 * 144.0 - 72.0];
-                let Some(found) = Camera::LBC.ground(point) else {
+                let Some(found) = GroundCamera::LBC.ground(point) else {
                     assert!(v <= 0.0, "{column}, {row}");
                     continue;
                 };
@@ -93,11 +93,11 @@ mod tests {
     #[test]
     fn no_ground_at_the_horizon_or_above() {
         for y in [Real::ZERO, -Real::DELTA, -Real::ONE, Real::MIN] {
-            assert_eq!(Camera::LBC.ground(ImagePoint { x: Real::ZERO, y }), None);
+            assert_eq!(GroundCamera::LBC.ground(ImagePoint { x: Real::ZERO, y }), None);
         }
-        let far = Camera::LBC.ground(ImagePoint { x: Real::MAX, y: Real::DELTA }).unwrap();
-        assert_eq!(far.right, Real::MAX.saturating_div(Camera::LBC.focal_length[0]));
-        let flat = Camera { size: [1, 0], focal_length: [Real::ZERO; 2], ..Camera::LBC };
+        let far = GroundCamera::LBC.ground(ImagePoint { x: Real::MAX, y: Real::DELTA }).unwrap();
+        assert_eq!(far.right, Real::MAX.saturating_div(GroundCamera::LBC.focal_length[0]));
+        let flat = GroundCamera { size: [1, 0], focal_length: [Real::ZERO; 2], ..GroundCamera::LBC };
         assert_eq!(flat.image_point([5, 5]), ImagePoint { x: -Real::ONE, y: Real::from(5) / -32 - Real::ONE });
         assert_eq!(flat.ground(ImagePoint { x: Real::ONE, y: Real::ONE }), None);
     }

@@ -123,7 +123,8 @@ impl<const N: usize> Planner<N> {
 
     /// Index of the node that counts as reached, 0 where none but the first may.
     fn reached(&self, own: Position) -> usize {
-        let (mut reached, mut farthest, mut travel) = (0, Real::ZERO, Real::ZERO);
+        // Below every distance: a node may lie exactly under the vehicle.
+        let (mut reached, mut farthest, mut travel) = (0, -Real::ONE, Real::ZERO);
         let pairs = self.nodes.iter().zip(self.nodes.iter().enumerate().skip(1));
         for (before, (index, node)) in pairs {
             if travel > self.horizon.look_ahead {
@@ -178,6 +179,12 @@ mod tests {
         // 10 is 3 m behind, 12 is 1 m behind: 10 is the farther one, and only it is passed.
         assert_eq!(next(&mut planner, 13), Some(place(12, 0)));
         assert_eq!(planner.nodes().len(), 4);
+    }
+
+    #[test]
+    fn a_node_under_the_vehicle_is_reached() {
+        let mut planner = planner(&[0, 10, 30, 60]);
+        assert_eq!(next(&mut planner, 10), Some(place(30, 0)));
     }
 
     #[test]

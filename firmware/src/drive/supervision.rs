@@ -1,6 +1,7 @@
 //! Whether the vehicle may be driven: what is measured must be there, recent and possible.
 
 use super::Real;
+use super::schedule::STEP_MS;
 use core::fmt;
 
 /// One measurement as it reaches a step.
@@ -11,6 +12,8 @@ pub enum Reading<T> {
     Missing,
     /// The sensor answers, but with no number (a NaN).
     NotANumber,
+    /// The sensor answers, but has said the same for longer than it can be true.
+    Frozen,
     /// A value.
     Value {
         /// What was measured; `()` where the data go to the network by another way.
@@ -24,6 +27,17 @@ impl<T> Reading<T> {
     /// A value measured in this step.
     pub const fn now(value: T) -> Self {
         Self::Value { value, age_ms: 0 }
+    }
+
+    /// The value, if it is there and at most `limit_ms` old.
+    pub(super) fn recent(self, sensor: Sensor, limit_ms: u16) -> Result<T, Fault> {
+        match self {
+            Self::Missing => Err(Fault::Missing(sensor)),
+            Self::NotANumber => Err(Fault::Invalid(sensor)),
+            Self::Frozen => Err(Fault::Frozen(sensor)),
+            Self::Value { age_ms, .. } if age_ms > limit_ms => Err(Fault::Stale(sensor)),
+            Self::Value { value, .. } => Ok(value),
+        }
     }
 }
 
@@ -66,6 +80,8 @@ pub enum Fault {
     Stale(Sensor),
     /// The measurement is no number, or none that the vehicle can have.
     Invalid(Sensor),
+    /// The sensor says the same again and again.
+    Frozen(Sensor),
     /// There is no route.
     NoRoute,
     /// The network was not done in its step.
@@ -87,6 +103,7 @@ impl Fault {
             Self::NetworkOverrun => 0x50,
             Self::NetworkFailed => 0x60,
             Self::InvalidOutput => 0x70,
+            Self::Frozen(sensor) => 0x80 | sensor as u8,
         }
     }
 }
@@ -97,6 +114,7 @@ impl fmt::Display for Fault {
             Self::Missing(sensor) => write!(f, "{sensor} missing"),
             Self::Stale(sensor) => write!(f, "{sensor} too old"),
             Self::Invalid(sensor) => write!(f, "{sensor} invalid"),
+            Self::Frozen(sensor) => write!(f, "{sensor} frozen"),
             Self::NoRoute => f.write_str("no route"),
             Self::NetworkOverrun => f.write_str("network not done in its step"),
             Self::NetworkFailed => f.write_str("network failed"),
@@ -113,7 +131,8 @@ pub enum Status {
     Driving,
     /// Zero: the first step fills buffers.
     Filling,
-    /// The safe state, without a new fault: the vehicle is driven again when enough such steps have passed.
+    /// The safe state, without a new fault: the vehicle is driven again when enough such steps have passed and the
+    /// network has run in its turn.
     Recovering,
     /// The safe state, for this reason.
     Fault(Fault),
@@ -142,11 +161,21 @@ impl fmt::Display for Status {
     }
 }
 
-/// What is still acceptable.
+/// What is still acceptable. A measurement older than its limit is too old.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Limits {
-    /// Milliseconds after which a measurement is too old, by [`Sensor`]; `None` where the system does not use it.
-    pub age_ms: [Option<u16>; 5],
+    /// Age of the image, milliseconds.
+    pub camera_ms: u16,
+    /// Age of the sweep, milliseconds; `None` for a system that reads none.
+    pub lidar_ms: Option<u16>,
+    /// Age of the speed, milliseconds.
+    pub speed_ms: u16,
+    /// Age of the position, milliseconds.
+    pub position_ms: u16,
+    /// Age of the heading, milliseconds; `None` for a system that steers by none.
+    pub compass_ms: Option<u16>,
+    /// From the begin of a step to the network's answer, milliseconds.
+    pub network_ms: u16,
     /// Largest speed in either direction, m/s.
     pub speed: Real,
     /// Largest coordinate of the vehicle, meters.
@@ -158,53 +187,29 @@ pub struct Limits {
 }
 
 impl Limits {
-    /// Two missed steps of a fast sensor and four of a slow one; no faster than 100 m/s, within 32 km of the map's
-    /// origin, waypoints within the 128 m that the decoder can feed back; half a second of recovery.
-    pub const fn new(lidar: bool, compass: bool) -> Self {
-        const FAST: u16 = 100;
-        const SLOW: u16 = 200;
-        const SPEED: Real = Real::lit("100");
-        const POSITION: Real = Real::lit("32000");
-        const WAYPOINT: Real = Real::lit("128");
-        Self {
-            age_ms: [
-                Some(FAST),
-                if lidar { Some(FAST) } else { None },
-                Some(FAST),
-                Some(SLOW),
-                if compass { Some(SLOW) } else { None },
-            ],
-            speed: SPEED,
-            position: POSITION,
-            waypoint: WAYPOINT,
-            recovery_steps: 10,
-        }
-    }
-
-    /// Whether the system uses the sensor.
-    pub fn uses(&self, sensor: Sensor) -> bool {
-        self.age_limit(sensor).is_some()
-    }
-
-    /// The value of a reading that is there and recent.
-    ///
-    /// # Errors
-    ///
-    /// Missing, invalid or stale, unless the system does not use the sensor: then `Ok(None)`.
-    pub fn check<T: Copy>(&self, sensor: Sensor, reading: Reading<T>) -> Result<Option<T>, Fault> {
-        let Some(limit) = self.age_limit(sensor) else { return Ok(None) };
-        match reading {
-            Reading::Missing => Err(Fault::Missing(sensor)),
-            Reading::NotANumber => Err(Fault::Invalid(sensor)),
-            Reading::Value { age_ms, .. } if age_ms > limit => Err(Fault::Stale(sensor)),
-            Reading::Value { value, .. } => Ok(Some(value)),
-        }
-    }
-
-    fn age_limit(&self, sensor: Sensor) -> Option<u16> {
-        self.age_ms.get(usize::from(sensor as u8)).copied().flatten()
-    }
+    /// Camera, LiDAR and compass: two missed steps of a fast sensor and four of a slow one; an answer within its step;
+    /// no faster than 100 m/s, within 32 km of the map's origin, waypoints within the 128 m that the decoder can feed
+    /// back; half a second of recovery.
+    pub const CAMERA_AND_LIDAR: Self = Self {
+        camera_ms: FAST_MS,
+        lidar_ms: Some(FAST_MS),
+        speed_ms: FAST_MS,
+        position_ms: SLOW_MS,
+        compass_ms: Some(SLOW_MS),
+        network_ms: STEP_MS,
+        speed: Real::lit("100"),
+        position: Real::lit("32000"),
+        waypoint: Real::lit("128"),
+        recovery_steps: 10,
+    };
+    /// The same without a LiDAR.
+    pub const CAMERA: Self = Self { lidar_ms: None, ..Self::CAMERA_AND_LIDAR };
+    /// The same without LiDAR and compass.
+    pub const CAMERA_WITHOUT_COMPASS: Self = Self { compass_ms: None, ..Self::CAMERA };
 }
+
+const FAST_MS: u16 = 2 * STEP_MS;
+const SLOW_MS: u16 = 4 * STEP_MS;
 
 /// How often what happened, since the start; the counts stop at their largest value.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -212,6 +217,8 @@ impl Limits {
 pub struct Counters {
     /// Steps.
     pub steps: u32,
+    /// Ticks that passed without a step.
+    pub skipped: u32,
     /// Steps for which the network was asked.
     pub network_runs: u32,
     /// Steps in the safe state, recovery included.
@@ -224,6 +231,8 @@ pub struct Counters {
     pub stale: u32,
     /// [`Fault::Invalid`].
     pub invalid: u32,
+    /// [`Fault::Frozen`].
+    pub frozen: u32,
     /// [`Fault::NoRoute`].
     pub no_route: u32,
     /// [`Fault::NetworkOverrun`].
@@ -241,6 +250,7 @@ impl Counters {
             Fault::Missing(_) => &mut self.missing,
             Fault::Stale(_) => &mut self.stale,
             Fault::Invalid(_) => &mut self.invalid,
+            Fault::Frozen(_) => &mut self.frozen,
             Fault::NoRoute => &mut self.no_route,
             Fault::NetworkOverrun => &mut self.overruns,
             Fault::NetworkFailed => &mut self.network_failures,

@@ -14,7 +14,7 @@ pub(super) fn validate(step: &BranchLinear, context: &StepContext<'_, '_>) -> Re
     context.ensure_equal(Check::StepShape, output.positions(), input.positions())?;
     let command = context.typed(step.command, ElementType::I8)?.shape;
     context.ensure_equal(Check::StepShape, command.elements(), 1_u64)?;
-    context.ensure_within(Check::StepBranches, step.branches, 1..=i64::from(u16::MAX))?;
+    context.ensure_within(Check::StepBranches, step.branches, 1..=i64::from(i8::MAX))?;
     let block = plan::weight_bytes(step.kernel, 1, output.channels, input.channels.into());
     context.constants::<i8>(step.weights, block.saturating_mul(step.branches.into()))?;
     let alone = step.rescale.residual == Residual::None;
@@ -78,7 +78,7 @@ mod tests {
         for (command, index) in expected {
             assert_eq!(branch(command, 6), index, "command {command}");
         }
-        assert_eq!((branch(i8::MAX, 127), branch(i8::MAX, u16::MAX), branch(9, 1), branch(9, 0)), (126, 126, 0, 0));
+        assert_eq!((branch(i8::MAX, 127), branch(9, 1), branch(9, 0)), (126, 0, 0));
     }
 
     #[test]

@@ -1,12 +1,12 @@
 //! Camera rows to codes: the image, perhaps scaled down, cropped at its center, as `u8 − 128`.
 //!
 //! A [`Camera`] takes the rows of an image as they arrive, whole or in pieces, in any order, and writes into the
-//! network's input at once; only what the crop needs is read. [`Camera::finish`] tells which rows never came and whether
-//! the camera is frozen. The crop begins at row `(H − h)/2` and column `(W − w)/2` of the scaled image, rounded down: for
-//! 400×300 and 256×256 at row 22 and column 72.
+//! network's input at once; only what the crop needs is read. [`Camera::finish`] tells which rows never came and
+//! whether the camera is frozen. The crop begins at row `(H − h)/2` and column `(W − w)/2` of the scaled image, rounded
+//! down: for 400×300 and 256×256 at row 22 and column 72.
 //!
 //! ```
-//! use firmware::sensors::camera::{Camera, CameraLayout, PixelFormat, Scale, Status};
+//! use firmware::sensors::camera::{Camera, CameraLayout, PixelFormat, Scale, FrameStatus};
 //! use firmware::tensor::Shape;
 //!
 //! let map = Shape::map(4, 4, 3);
@@ -25,11 +25,12 @@
 //! for row in 0..6 {
 //!     camera.push(row, 0, &[255; 8 * 4], &mut input).unwrap();
 //! }
-//! assert_eq!(camera.finish(), Ok(Status::Live));
+//! assert_eq!(camera.finish(), Ok(FrameStatus::Live));
 //! assert_eq!(input, [127; 48]);
 //! ```
 
 use super::InputSize;
+use crate::drive::Reading;
 use crate::tensor::Shape;
 use core::fmt;
 
@@ -44,8 +45,8 @@ pub use format::{PixelFormat, YuvRange};
 
 /// How much smaller than the image its crop is taken. [`Self::Full`] takes the pixels as they are.
 ///
-/// Otherwise a component of a pixel is `R(Σ, 2k)` over the `2^k × 2^k` pixels that it covers, ties up; of YUV formats Y,
-/// U and V are averaged before they become RGB. Rows and columns beyond the last whole pixel are left out.
+/// Otherwise a component of a pixel is `R(Σ, 2k)` over the `2^k × 2^k` pixels that it covers, ties up; of YUV formats
+/// Y, U and V are averaged before they become RGB. Rows and columns beyond the last whole pixel are left out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Scale {
@@ -275,7 +276,7 @@ impl core::error::Error for MissingRows {}
 /// What a whole frame says about its camera.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
-pub enum Status {
+pub enum FrameStatus {
     /// The image changes, or has not stood still for long.
     Live,
     /// The image is equal to the ones before.
@@ -283,4 +284,16 @@ pub enum Status {
         /// Frames in a row that were equal to the one before.
         repeats: u16,
     },
+}
+
+/// What the driver is to know of a frame that ended in this step.
+impl From<Result<FrameStatus, MissingRows>> for Reading<()> {
+    fn from(frame: Result<FrameStatus, MissingRows>) -> Self {
+        match frame {
+            Ok(FrameStatus::Live) => Self::now(()),
+            Ok(FrameStatus::Frozen { .. }) => Self::Frozen,
+            // The input holds rows of several moments.
+            Err(MissingRows { .. }) => Self::Missing,
+        }
+    }
 }

@@ -1,13 +1,13 @@
 //! Which cells of the camera image and of the bird's-eye view see the same points: the inputs `bev_points` and
 //! `cam_points` of Geometric Fusion.
 //!
-//! Both views have 8×8 cells. A point that both see joins its two cells: the camera's cell is listed under the cell on the
-//! ground, and the other way round, up to five each, in the order of points. (The published preparation draws five at
-//! random; the first five are one such draw.) Entries without a point are cell (0, 0), which the network was trained to
-//! gather too.
+//! Both views have 8×8 cells. A point that both see joins its two cells: the camera's cell is listed under the cell on
+//! the ground, and the other way round, up to five each, in the order of points. (The published preparation draws five
+//! at random; the first five are one such draw.) Entries without a point are cell (0, 0), which the network was trained
+//! to gather too.
 //!
-//! The trained network depends on how its authors looked at a point, so this is kept as it was: the height of a point is
-//! ignored, left is taken for right in the image, and cells on the ground are ±16 m × 32 m, counted from the sensor.
+//! The trained network depends on how its authors looked at a point, so this is kept as it was: the height of a point
+//! is ignored, left is taken for right in the image, and cells on the ground are ±16 m × 32 m, counted from the sensor.
 
 use super::lidar::Point;
 use super::{InputSize, NotFinite};
@@ -37,8 +37,8 @@ pub struct Intrinsics {
     pub center: [I16F16; 2],
     /// Binary logarithm of the side of a cell: the crop is a square of eight cells.
     pub cell_bits: u8,
-    /// How far below the camera every point is taken to lie, m.
-    pub depth: I16F16,
+    /// Of the camera above the ground, m; every point is taken to lie on the ground.
+    pub height: I16F16,
 }
 
 impl Intrinsics {
@@ -49,18 +49,19 @@ impl Intrinsics {
         focal_y: I16F16::from_bits(10_998_247),
         center: [I16F16::from_bits(128 << 16), I16F16::from_bits(128 << 16)],
         cell_bits: 5,
-        depth: I16F16::from_bits(150_733),
+        height: I16F16::from_bits(150_733),
     };
 
     /// Cell `(column, row)` of the image that shows a point; `None` outside of the crop.
     ///
-    /// `u = focal_x·left/forward + center`, `v = focal_y·depth/forward + center`. Instead of dividing, the numerator is
-    /// compared with multiples of the denominator: exact in 64 bits for every point on the ground cells. With coordinates within 2^-16 m and factors within
-    /// 2^-17 of the real ones, u and v of a point in the published crop (more than 3 m ahead) are met within 1/500 pixel.
+    /// `u = focal_x·left/forward + center`, `v = focal_y·height/forward + center`. Instead of dividing, the numerator
+    /// is compared with multiples of the denominator: exact in 64 bits for every point on the ground cells. With
+    /// coordinates within 2^-16 m and factors within 2^-17 of the real ones, u and v of a point in the published crop
+    /// (more than 3 m ahead) are met within 1/500 pixel.
     fn cell(&self, left: i32, forward: i32) -> Option<[u8; 2]> {
         let [center_x, center_y] = self.center.map(|center| product(center.to_bits(), forward));
         let across = product(self.focal_x.to_bits(), left).wrapping_add(center_x);
-        let down = product(self.focal_y.to_bits(), self.depth.to_bits()).wrapping_add(center_y);
+        let down = product(self.focal_y.to_bits(), self.height.to_bits()).wrapping_add(center_y);
         // Forward in pixels of a cell: Q32 like the numerators.
         let cell = i64::from(forward).wrapping_shl(u32::from(self.cell_bits.min(12)).wrapping_add(16));
         Some([eighth(across, cell)?, eighth(down, cell)?])
@@ -232,7 +233,7 @@ mod tests {
             focal_y: q16(focal()),
             center: [q16(200.0 - 72.0), q16(150.0 - 22.0)],
             cell_bits: 5,
-            depth: q16(2.3),
+            height: q16(2.3),
         };
         assert_eq!(Intrinsics::PUBLISHED, expected);
     }
@@ -332,7 +333,7 @@ mod tests {
         #[test]
         fn any_intrinsics_and_points_give_cells(bits: [i32; 5], cell_bits: u8, left: i32, forward in 1..=i32::MAX) {
             let [a, b, c, d, e] = bits.map(I16F16::from_bits);
-            let intrinsics = Intrinsics { focal_x: a, focal_y: b, center: [c, d], cell_bits, depth: e };
+            let intrinsics = Intrinsics { focal_x: a, focal_y: b, center: [c, d], cell_bits, height: e };
             for cell in intrinsics.cell(left, forward).into_iter().flatten() {
                 prop_assert!(cell < 8);
             }

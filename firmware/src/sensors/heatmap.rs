@@ -47,8 +47,8 @@ pub fn draw(goal: [i32; 2], input: &mut [i8]) -> Result<(), InputSize> {
     Ok(())
 }
 
-/// Column and row of the goal: `round(5.5·[right, y] + [128, 256])`, ties to even, clipped to 0..=256 and clamped to the
-/// image.
+/// Column and row of the goal: `round(5.5·[right, y] + [128, 256])`, ties to even, clipped to 0..=256 and clamped to
+/// the image.
 fn center([right, y]: [i32; 2]) -> [u16; 2] {
     let pixel = |meters: i32, origin: i64, size: u16| {
         // 11 half pixels per meter: Q17 pixels.

@@ -1,7 +1,7 @@
 //! From the files of a step to the inputs of the network: the firmware's own sensors.
 
 use super::log::LoggedFrame;
-use firmware::drive::{NetworkInputs, System};
+use firmware::drive::{Measurements, NetworkInputs, Reading, System};
 use firmware::image::{Image, Port};
 use firmware::sensors::camera::{Camera, CameraLayout, PixelFormat, Scale};
 use firmware::sensors::correspondences::{Correspondences, Intrinsics};
@@ -56,57 +56,93 @@ impl<'a> Rig<'a> {
         self.ports.iter().find(|(port, _)| port.name == name).map(|&(_, shape)| shape)
     }
 
-    /// Bytes of all inputs in one step.
+    /// Lets the sensors take the files of a step.
     ///
     /// # Errors
-    /// A file of the step is missing or damaged.
-    pub fn inputs(&self, frame: &LoggedFrame, small: &NetworkInputs) -> Result<Vec<Vec<u8>>> {
-        let points = self.ports.iter().any(|(port, _)| matches!(port.name, "bev" | "bev_points" | "cam_points"));
-        let points = points.then(|| read_points(&frame.folder.join("lidar.bin"))).transpose()?.unwrap_or_default();
-        let input = |(port, shape): &(Port<'_>, Shape)| match port.name {
-            "rgb" => {
-                let mut codes = codes(*shape);
-                capture(&frame.folder.join("rgb.png"), *shape, View::Front, &mut codes)?;
-                Ok(bytes(&codes))
-            }
-            "views" => {
-                let mut codes = codes(*shape);
-                for (view, file) in View::LBC.into_iter().zip(["rgb.png", "rgb_left.png", "rgb_right.png"]) {
-                    capture(&frame.folder.join(file), *shape, view, &mut codes)?;
+    /// A file of a sensor that is not missing is, or is damaged; or an input that no sensor of a log fills.
+    pub fn sense(&self, frame: &LoggedFrame) -> Result<Sensed<'_, 'a>> {
+        let mut measurements = frame.measurements;
+        let Measurements { camera, lidar, .. } = frame.measurements;
+        let reads_points = self.ports.iter().any(|(port, _)| matches!(port.name, "bev" | "bev_points" | "cam_points"));
+        let points = (reads_points && is_there(lidar)).then(|| read_points(&frame.folder.join("lidar.bin")));
+        let points = points.transpose()?.unwrap_or_default();
+        let mut inputs = Vec::new();
+        for (port, shape) in &self.ports {
+            let mut codes = vec![0; shape.elements() as usize];
+            match port.name {
+                "rgb" if is_there(camera) => {
+                    measurements.camera = capture(&frame.folder.join("rgb.png"), *shape, View::Front, &mut codes)?;
                 }
+                "views" if is_there(camera) => {
+                    for (view, file) in View::LBC.into_iter().zip(["rgb.png", "rgb_left.png", "rgb_right.png"]) {
+                        let reading = capture(&frame.folder.join(file), *shape, view, &mut codes)?;
+                        if is_there(measurements.camera) {
+                            measurements.camera = reading;
+                        }
+                    }
+                }
+                "bev" if is_there(lidar) => measurements.lidar = self.sweep(frame, &points, &mut codes)?,
+                "bev_points" => [codes, _] = cells(*shape, frame, &points)?,
+                "cam_points" => [_, codes] = cells(*shape, frame, &points)?,
+                "rgb" | "views" | "bev" | "velocity" | "goal" | "command" => {}
+                name => {
+                    let message = "no sensor of a log gives this input";
+                    return Err(Error::new(ErrorCode::Unsupported, format!("input `{name}`"), message));
+                }
+            }
+            inputs.push(codes);
+        }
+        Ok(Sensed { rig: self, measurements, inputs })
+    }
+
+    fn sweep(&self, frame: &LoggedFrame, points: &[[u32; 3]], counts: &mut [i8]) -> Result<Reading<()>> {
+        let Some(histogram) = self.histogram else { return Ok(Reading::Missing) };
+        let refuse = |e| Error::new(ErrorCode::Unsupported, "input `bev`", format!("{e}"));
+        let mut sweep = Sweep::new(histogram, counts).map_err(refuse)?;
+        points.iter().for_each(|&point| sweep.push(frame.mounting.place(point)));
+        Ok(sweep.finish().into())
+    }
+}
+
+/// What the sensors gave in one step: to the driver, and to the network.
+#[derive(Debug)]
+pub struct Sensed<'r, 'a> {
+    rig: &'r Rig<'a>,
+    /// For the driver.
+    pub measurements: Measurements,
+    /// What camera and LiDAR wrote, per input; zeros where they wrote nothing.
+    inputs: Vec<Vec<i8>>,
+}
+
+impl Sensed<'_, '_> {
+    /// Bytes of all inputs of the network, with the small ones that the driver gives.
+    ///
+    /// # Errors
+    /// The map of views has no channel for the goal.
+    pub fn inputs(&self, small: &NetworkInputs) -> Result<Vec<Vec<u8>>> {
+        let input = |(port, codes): (&Port<'_>, &Vec<i8>)| match port.name {
+            "views" => {
+                let mut codes = codes.clone();
                 let drawn = heatmap::draw(small.goal.map(I16F16::to_bits), &mut codes);
                 drawn.map_err(|e| Error::new(ErrorCode::Unsupported, "input `views`", e.to_string()))?;
                 Ok(bytes(&codes))
             }
-            "bev" => Ok(bytes(&self.sweep(*shape, frame, &points)?)),
-            "bev_points" => Ok(bytes(&cells(*shape, frame, &points)?[0])),
-            "cam_points" => Ok(bytes(&cells(*shape, frame, &points)?[1])),
             "velocity" => Ok(small.velocity_bytes().to_vec()),
             "goal" => Ok(small.goal_bytes().to_vec()),
             "command" => Ok(small.command_bytes().to_vec()),
-            name => Err(Error::new(
-                ErrorCode::Unsupported,
-                format!("input `{name}`"),
-                "no sensor of a log gives this input",
-            )),
+            _ => Ok(bytes(codes)),
         };
-        self.ports.iter().map(input).collect()
-    }
-
-    fn sweep(&self, shape: Shape, frame: &LoggedFrame, points: &[[u32; 3]]) -> Result<Vec<i8>> {
-        let mut counts = codes(shape);
-        if let Some(histogram) = self.histogram {
-            let refuse = |e| Error::new(ErrorCode::Unsupported, "input `bev`", format!("{e}"));
-            let mut sweep = Sweep::new(histogram, &mut counts).map_err(refuse)?;
-            points.iter().for_each(|&point| sweep.push(frame.mounting.place(point)));
-            sweep.finish();
-        }
-        Ok(counts)
+        self.rig.ports().zip(&self.inputs).map(input).collect()
     }
 }
 
-/// What a network sees of an image file: the centered crop, in the view's channels.
-fn capture(path: &Path, map: Shape, view: View, codes: &mut [i8]) -> Result<()> {
+const fn is_there(reading: Reading<()>) -> bool {
+    matches!(reading, Reading::Value { .. })
+}
+
+/// What a network sees of an image file: the centered crop, in the view's channels. No camera counts as frozen: a
+/// recording of a standing vehicle may repeat its images.
+fn capture(path: &Path, map: Shape, view: View, codes: &mut [i8]) -> Result<Reading<()>> {
     let image = camera::decode(path)?;
     let refuse = |message: String| Error::new(ErrorCode::Frames, path.display().to_string(), message);
     let size = [image.width(), image.height()].map(|side| u16::try_from(side).unwrap_or(u16::MAX));
@@ -123,12 +159,12 @@ fn capture(path: &Path, map: Shape, view: View, codes: &mut [i8]) -> Result<()> 
     let mut camera = Camera::new(layout, &mut memory).map_err(|e| refuse(e.to_string()))?;
     let pushed = camera.push_image(image.as_raw(), image.width() * 3, codes);
     pushed.map_err(|e| refuse(e.to_string()))?;
-    camera.finish().map(|_| ()).map_err(|e| refuse(e.to_string()))
+    Ok(camera.finish().into())
 }
 
 /// Cells of Geometric Fusion: of the histogram, of the camera.
 fn cells(shape: Shape, frame: &LoggedFrame, points: &[[u32; 3]]) -> Result<[Vec<i8>; 2]> {
-    let [mut bev, mut camera] = [codes(shape), codes(shape)];
+    let [mut bev, mut camera] = [(); 2].map(|()| vec![0; shape.elements() as usize]);
     let lists = Correspondences::new(Intrinsics::PUBLISHED, &mut bev, &mut camera);
     let mut lists = lists.map_err(|e| Error::new(ErrorCode::Unsupported, "input `bev_points`", e.to_string()))?;
     points.iter().for_each(|&point| lists.push(frame.mounting.place(point)));
@@ -146,10 +182,6 @@ fn read_points(path: &PathBuf) -> Result<Vec<[u32; 3]>> {
     }
     let word = |point: &[u8; POINT_BYTES], i: usize| u32::from_le_bytes([0, 1, 2, 3].map(|byte| point[4 * i + byte]));
     Ok(points.iter().map(|point| [0, 1, 2].map(|i| word(point, i))).collect())
-}
-
-fn codes(shape: Shape) -> Vec<i8> {
-    vec![0; shape.elements() as usize]
 }
 
 fn bytes(codes: &[i8]) -> Vec<u8> {

@@ -269,8 +269,9 @@ pub(super) fn output_shape(op: &Op, inputs: &[Shape]) -> Result<Shape, String> {
             arity(op, inputs, 2..=2)?;
             let w = &layer.weights.shape;
             expect("rank of branch weights", w.len(), 3)?;
-            if w[0] == 0 {
-                return Err("branches: found 0, expected at least 1".into());
+            // As many as an i8 command can name.
+            if !(1..=127).contains(&w[0]) {
+                return Err(format!("branches: found {}, expected 1..=127", w[0]));
             }
             expect("input channels", w[2], channels(inputs[0]))?;
             if let Some(bias) = &layer.bias {

@@ -82,7 +82,7 @@ fn lidar(data: &mut Unstructured<'_>) -> Result<()> {
         focal_y: fixed(data)?,
         center: [fixed(data)?, fixed(data)?],
         cell_bits: u8::arbitrary(data)?,
-        depth: fixed(data)?,
+        height: fixed(data)?,
     };
     let (mut bev, mut cam) = ([99; ELEMENTS], [99; ELEMENTS]);
     let mut lists = Correspondences::new(intrinsics, &mut bev, &mut cam).expect("their own sizes");

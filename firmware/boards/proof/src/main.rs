@@ -9,13 +9,13 @@
 
 use core::hint::black_box;
 use core::panic::PanicInfo;
-use firmware::drive::{Driver, GpsPlane, Measurements, NetworkOutput, Output, RouteNode, Status, Step, System};
+use firmware::drive::{Driver, GpsPlane, Measurements, NetworkOutput, Output, Real, RouteNode, Status, Step, System};
 use firmware::engine::{Engine, Progress};
 use firmware::image::Image;
 use firmware::kernels::Portable;
 use firmware::sensors::camera::{Camera, CameraLayout};
 use firmware::sensors::correspondences::{Correspondences, Intrinsics};
-use firmware::sensors::lidar::{Histogram, Motion, Mounting, Pose, Sweep};
+use firmware::sensors::lidar::{Heading, Histogram, Motion, Mounting, Pose, Sweep};
 use firmware::sensors::{heatmap, inputs};
 use firmware::waypoint::Waypoint;
 use fixed::types::I16F16;
@@ -65,6 +65,7 @@ struct Raw<'a> {
     intrinsics: Option<Intrinsics>,
     numbers: [u32; 3],
     split: I16F16,
+    compass: Real,
 }
 
 fn sense(raw: &Raw<'_>) -> Option<()> {
@@ -77,6 +78,7 @@ fn sense(raw: &Raw<'_>) -> Option<()> {
     camera.clear();
 
     let (mounting, [capture, current]) = raw.poses?;
+    let current = Pose { heading: Heading::from_compass(raw.compass), ..current };
     let motion = Motion::between(&capture, &current);
     let points = || raw.points.iter().map(|&bits| mounting.place(bits).map(|point| motion.apply(point)));
     let histogram = Histogram::new(raw.layout?.map, raw.split).ok()?;
@@ -124,6 +126,7 @@ fn drive_by(trip: &Trip<'_>, system: System) -> Option<()> {
     for node in trip.nodes {
         driver.route().push(*node).ok()?;
     }
+    driver.skip();
     for answer in [
         NetworkOutput::Waypoints(trip.waypoints),
         NetworkOutput::ImagePoints(trip.points),
@@ -132,7 +135,7 @@ fn drive_by(trip: &Trip<'_>, system: System) -> Option<()> {
         // As after any number of steps.
         let driver = black_box(&mut driver);
         let Output { controls, status } = match driver.step(trip.measurements.as_ref()?) {
-            Step::Network(pending) => pending.finish(Ok(answer)),
+            Step::Network(pending) => pending.finish(Ok(answer), black_box(0)),
             Step::Done(output) => output,
         };
         black_box(controls);

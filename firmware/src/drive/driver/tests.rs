@@ -35,7 +35,7 @@ fn waypoints() -> [Waypoint; 4] {
 /// One step, and whether the network was asked.
 fn step(driver: &mut Driver<4>, measurements: &Measurements) -> (Output, bool) {
     match driver.step(measurements) {
-        Step::Network(pending) => (pending.finish(Ok(NetworkOutput::Waypoints(&waypoints()))), true),
+        Step::Network(pending) => (pending.finish(Ok(NetworkOutput::Waypoints(&waypoints())), 0), true),
         Step::Done(output) => (output, false),
     }
 }
@@ -88,14 +88,14 @@ fn inputs_of_the_network_are_goal_velocity_and_command() {
     assert_eq!((inputs.velocity, inputs.command), (I8F8::from_num(3), Command::Straight));
     assert_eq!(inputs.goal_bytes(), [0, 0, 3, 0, 0, 0, 216, 255]);
     assert_eq!((inputs.velocity_bytes(), inputs.command_bytes()), ([0, 3], [3]));
-    pending.finish(Ok(NetworkOutput::Waypoints(&waypoints())));
+    pending.finish(Ok(NetworkOutput::Waypoints(&waypoints())), 0);
 }
 
 #[test]
 fn cilrs_drives_by_its_own_outputs() {
     let mut driver = warm(System::Cilrs, 1);
     let Step::Network(pending) = driver.step(&healthy()) else { panic!("step 1 runs the network") };
-    let Output { controls, status } = pending.finish(Ok(NetworkOutput::Controls([1 << 14, 1 << 14, 1 << 12])));
+    let Output { controls, status } = pending.finish(Ok(NetworkOutput::Controls([1 << 14, 1 << 14, 1 << 12])), 0);
     // Throttle 0.375 beats brake 0.125.
     assert_eq!(controls, Controls { throttle: Real::lit("0.375"), ..Controls::ZERO });
     assert_eq!(status, Status::Driving);
@@ -106,7 +106,7 @@ fn lbc_drives_by_the_ground_under_its_image_points() {
     let mut driver = warm(System::Lbc, 1);
     let Step::Network(pending) = driver.step(&healthy()) else { panic!("step 1 runs the network") };
     // On the center line, 51.36 and 36 pixels below the horizon: 1.38 m between their ground points.
-    let output = pending.finish(Ok(NetworkOutput::ImagePoints(&[[8160, 7840], [8160, 6864], [0, 0], [0, 0]])));
+    let output = pending.finish(Ok(NetworkOutput::ImagePoints(&[[8160, 7840], [8160, 6864], [0, 0], [0, 0]])), 0);
     assert_eq!(output.status, Status::Driving);
     assert!(output.controls.steer.abs() < Real::from_num(0.001), "{output:?}");
     // 2.76 m/s are wanted, 3 m/s driven: too fast for the throttle, within the tenth that does not brake.
@@ -120,6 +120,7 @@ fn every_sensor_fault_has_its_status() {
     let cases = [
         (Measurements { camera: Reading::Missing, ..healthy() }, Fault::Missing(Sensor::Camera)),
         (Measurements { camera: old(101), ..healthy() }, Fault::Stale(Sensor::Camera)),
+        (Measurements { camera: Reading::Frozen, ..healthy() }, Fault::Frozen(Sensor::Camera)),
         (Measurements { lidar: old(500), ..healthy() }, Fault::Stale(Sensor::Lidar)),
         (Measurements { lidar: Reading::Missing, ..healthy() }, Fault::Missing(Sensor::Lidar)),
         (Measurements { speed: Reading::NotANumber, ..healthy() }, Fault::Invalid(Sensor::Speed)),
@@ -151,7 +152,7 @@ fn only_transfuser_has_a_heading_for_a_compass_that_is_not_a_number() {
     let mut driver = warm(System::TransFuser, 6);
     let Step::Network(pending) = driver.step(&blind) else { panic!("step 6 runs the network") };
     assert_eq!(pending.inputs().goal, [I16F16::from_num(3), I16F16::from_num(-40)], "as under heading 0");
-    pending.finish(Ok(NetworkOutput::Waypoints(&waypoints())));
+    pending.finish(Ok(NetworkOutput::Waypoints(&waypoints())), 0);
     assert_eq!(driver.counters().substituted_headings, 1);
     for system in [System::Aim, System::LateFusion, System::GeometricFusion, System::Lbc] {
         assert_eq!(status(&mut warm(system, 5), &blind), Status::Fault(Fault::Invalid(Sensor::Compass)), "{system:?}");
@@ -170,23 +171,24 @@ fn without_a_route_the_vehicle_stays() {
 }
 
 #[test]
-fn the_safe_state_holds_the_steering_and_ends_after_ten_good_steps() {
+fn the_safe_state_holds_the_steering_and_ends_after_ten_good_steps_on_one_of_the_network() {
     let mut driver = warm(System::TransFuser, 21);
     let (before, _) = step(&mut driver, &healthy());
     let blind = Measurements { camera: Reading::Missing, ..healthy() };
     let stop = Controls::stop(before.controls.steer);
     let (output, _) = step(&mut driver, &blind);
     assert_eq!(output, Output { controls: stop, status: Status::Fault(Fault::Missing(Sensor::Camera)) });
-    for count in 0..10 {
+    // The fault was on step 22. Ten good steps end with 32; 33 is odd, and its sweep is not the network's.
+    for count in 23..=33 {
         let (output, asked) = step(&mut driver, &healthy());
-        assert_eq!(output, Output { controls: stop, status: Status::Recovering }, "good step {count}");
-        assert!(asked, "no waypoints from before the fault are driven on");
+        assert_eq!(output, Output { controls: stop, status: Status::Recovering }, "step {count}");
+        assert_eq!(asked, count % 2 == 0, "step {count}");
     }
     let controls = Controller::new(System::TransFuser.profile().tuning)
         .step([0, 1].map(|k| Point::from(waypoints()[k])), Real::from(3));
     let (output, _) = step(&mut driver, &healthy());
     assert_eq!(output, Output { controls, status: Status::Driving }, "as a fresh controller");
-    assert_eq!((driver.counters().safe_steps, driver.counters().missing), (11, 1));
+    assert_eq!((driver.counters().safe_steps, driver.counters().missing), (12, 1));
 }
 
 #[test]
@@ -209,7 +211,7 @@ fn a_network_that_gives_nothing_stops_the_vehicle() {
     {
         let mut driver = warm(System::Aim, 5);
         let Step::Network(pending) = driver.step(&healthy()) else { panic!("the network runs every step") };
-        assert_eq!(pending.finish(Err(error)).status, Status::Fault(fault));
+        assert_eq!(pending.finish(Err(error), 0).status, Status::Fault(fault));
     }
 }
 
@@ -221,6 +223,33 @@ fn a_step_that_was_not_finished_is_an_overrun() {
     assert_eq!(status(&mut driver, &healthy()), Status::Fault(Fault::NetworkOverrun));
     assert_eq!(status(&mut driver, &healthy()), Status::Recovering);
     assert_eq!(driver.counters().overruns, 1);
+}
+
+#[test]
+fn an_answer_that_comes_too_late_stops_the_vehicle() {
+    for (elapsed_ms, expected) in [(50, Status::Driving), (51, Status::Fault(Fault::NetworkOverrun))] {
+        let mut driver = warm(System::Aim, 5);
+        let Step::Network(pending) = driver.step(&healthy()) else { panic!("the network runs every step") };
+        let output = pending.finish(Ok(NetworkOutput::Waypoints(&waypoints())), elapsed_ms);
+        assert_eq!(output.status, expected, "{elapsed_ms} ms");
+    }
+}
+
+#[test]
+fn a_skipped_tick_keeps_the_network_on_even_steps() {
+    // Steps 0 to 6; then tick 7 (odd) or ticks 7 and 8 pass without one.
+    for skipped in [1, 2] {
+        let mut driver = warm(System::TransFuser, 7);
+        (0..skipped).for_each(|_| driver.skip());
+        for count in 7 + skipped..30 {
+            let (output, asked) = step(&mut driver, &healthy());
+            assert_eq!(asked, count % 2 == 0, "{skipped} skipped, step {count}");
+            // Without the network's turn on tick 8 there is nothing to drive by on step 9.
+            let expected = if (skipped, count) == (2, 9) { Status::Recovering } else { Status::Driving };
+            assert_eq!(output.status, expected, "{skipped} skipped, step {count}");
+        }
+        assert_eq!(driver.counters().skipped, skipped);
+    }
 }
 
 #[test]
@@ -239,7 +268,7 @@ fn outputs_that_are_no_plan_stop_the_vehicle() {
         let mut driver = driver(system);
         step(&mut driver, &healthy());
         let Step::Network(pending) = driver.step(&healthy()) else { panic!("the network runs every step") };
-        assert_eq!(pending.finish(Ok(output)).status, Status::Fault(Fault::InvalidOutput), "{system:?}, {output:?}");
+        assert_eq!(pending.finish(Ok(output), 0).status, Status::Fault(Fault::InvalidOutput), "{system:?}, {output:?}");
     }
 }
 
@@ -257,7 +286,7 @@ fn controls_of_one_answer_are_those_of_the_first_driven_step() {
         let mut driver = driver(system);
         step(&mut driver, &healthy());
         let Step::Network(pending) = driver.step(&healthy()) else { panic!("the network runs") };
-        let driven = pending.finish(Ok(answer));
+        let driven = pending.finish(Ok(answer), 0);
         assert_eq!(driven.status, Status::Driving, "{system:?}");
         assert_eq!(system.profile().controls(answer, Real::from(3)), Ok(driven.controls), "{system:?}");
     }
@@ -271,7 +300,8 @@ fn controls_of_one_answer_are_those_of_the_first_driven_step() {
 #[test]
 fn every_status_has_a_code_of_its_own() {
     let sensors = [Sensor::Camera, Sensor::Lidar, Sensor::Speed, Sensor::Position, Sensor::Compass];
-    let faults = sensors.into_iter().flat_map(|s| [Fault::Missing(s), Fault::Stale(s), Fault::Invalid(s)]);
+    let faults =
+        sensors.into_iter().flat_map(|s| [Fault::Missing(s), Fault::Stale(s), Fault::Invalid(s), Fault::Frozen(s)]);
     let others = [Fault::NoRoute, Fault::NetworkOverrun, Fault::NetworkFailed, Fault::InvalidOutput];
     let plain = [Status::Driving, Status::Filling, Status::Recovering];
     let all: Vec<Status> = plain.into_iter().chain(faults.chain(others).map(Status::Fault)).collect();
@@ -294,6 +324,7 @@ fn any_reading<T: core::fmt::Debug + Clone>(value: impl Strategy<Value = T>) -> 
         0 => Reading::Missing,
         1 => Reading::NotANumber,
         2 => Reading::Value { value, age_ms },
+        3 => Reading::Frozen,
         _ => Reading::now(value),
     })
 }
@@ -336,15 +367,15 @@ proptest! {
                         forward: I16F16::from_bits(forward),
                     });
                     let own = match SYSTEMS[system] {
-                        System::Cilrs => NetworkOutput::Controls([codes[0][0], codes[0][1], codes[1][0]].map(|c| c as i16)),
+                        System::Cilrs => NetworkOutput::Controls([0, 1, 2].map(|k: usize| codes[k][0] as i16)),
                         System::Lbc => NetworkOutput::ImagePoints(&codes),
                         _ => NetworkOutput::Waypoints(&points),
                     };
                     match kind {
-                        1 => pending.finish(Err(NetworkError::Overrun)),
+                        1 => pending.finish(Err(NetworkError::Overrun), 0),
                         3 => continue,
-                        5 => pending.finish(Ok(NetworkOutput::Waypoints(&points[..1]))),
-                        _ => pending.finish(Ok(own)),
+                        5 => pending.finish(Ok(NetworkOutput::Waypoints(&points[..1])), 0),
+                        _ => pending.finish(Ok(own), 0),
                     }
                 }
             };

@@ -12,8 +12,8 @@ const FRACTION_BITS: u32 = 6;
 /// `u_j = min(R((max(q) − q_j)·M_u, n_u), 31·2^16)`; `e_j = 2^(−u_j)` in Q23 ([`exp2_q23`]);
 /// `column = floor(2^6·Σ e_j·column_j / Σ e_j)`, `row` alike.
 ///
-/// `input`: i16 logits, `height × width × channels`; `points`: two per channel. Precondition: height and width ≤ 256, so
-/// that the sums stay below 2^47. Channel by channel, each read twice: nothing is stored between the pixels.
+/// `input`: i16 logits, `height × width × channels`; `points`: two per channel. Precondition: height and width ≤ 256,
+/// so that the sums stay below 2^47. Channel by channel, each read twice: nothing is stored between the pixels.
 pub fn spatial_softmax(args: &SpatialSoftmaxArgs<'_>, input: &[i16], points: &mut [i32]) {
     let channels = usize::from(args.shape.channels);
     let columns = usize::from(args.shape.width).saturating_mul(channels);

@@ -2,7 +2,7 @@
 
 use super::format::{Span, Visitor, visit};
 use super::write::{Add, Pixels, Store, Write};
-use super::{CameraError, CameraLayout, LayoutError, MAX_BAND, MissingRows, Status};
+use super::{CameraError, CameraLayout, FrameStatus, LayoutError, MAX_BAND, MissingRows};
 use crate::sensors::InputSize;
 use crate::tensor::index;
 
@@ -136,7 +136,7 @@ impl<'a> Camera<'a> {
     ///
     /// # Errors
     /// Rows of the crop that are not whole. Such a frame is not compared with others.
-    pub fn finish(&mut self) -> Result<Status, MissingRows> {
+    pub fn finish(&mut self) -> Result<FrameStatus, MissingRows> {
         let missing = self.missing();
         let hash = self.hash;
         self.clear();
@@ -145,7 +145,7 @@ impl<'a> Camera<'a> {
         self.previous = Some(hash);
         let limit = self.layout.frozen_after;
         let is_frozen = limit > 0 && self.repeats >= limit;
-        Ok(if is_frozen { Status::Frozen { repeats: self.repeats } } else { Status::Live })
+        Ok(if is_frozen { FrameStatus::Frozen { repeats: self.repeats } } else { FrameStatus::Live })
     }
 
     fn missing(&self) -> Option<MissingRows> {
@@ -235,27 +235,29 @@ impl<'a> Camera<'a> {
         }
         let plane = usize::from(piece.is_chroma);
         let Some(mut band) = self.bands.get(plane).copied() else { return Ok(()) };
-        if band.row != Some(row) {
+        let is_new = band.row != Some(row);
+        if is_new {
             band = Band { row: Some(row), ..Band::default() };
-            self.clear_sums(piece.is_chroma);
         }
         let rows = 1_u32.wrapping_shl(bits) >> plane;
         let in_band = image_row.wrapping_sub(self.top).wrapping_shr(u32::from(piece.is_chroma)) & rows.wrapping_sub(1);
         let columns = u32::from(width).wrapping_shl(bits);
         let Some(received) = band.received.get_mut(index(in_band)) else { return Ok(()) };
-        let span = piece.span(self.left.wrapping_add(*received), self.left.wrapping_add(columns));
-        if let Ok(Some((span, count))) = span {
-            // Half as many rows of chroma: each counts twice.
-            let weight = if piece.is_chroma { 2 } else { 1 };
-            let add = Add { sums: self.sums, column: *received, bits, weight };
-            visit(self.layout.format, piece.is_chroma, piece.bytes, span, add);
-            *received = received.wrapping_add(count);
+        let span = piece.span(self.left.wrapping_add(*received), self.left.wrapping_add(columns))?;
+        let Some((span, count)) = span else { return Ok(()) };
+        // Only now: a piece that is refused or brings nothing leaves the band under way as it is.
+        if is_new {
+            self.clear_sums(piece.is_chroma);
         }
+        // Half as many rows of chroma: each counts twice.
+        let weight = if piece.is_chroma { 2 } else { 1 };
+        let add = Add { sums: self.sums, column: *received, bits, weight };
+        visit(self.layout.format, piece.is_chroma, piece.bytes, span, add);
+        *received = received.wrapping_add(count);
         let is_whole = band.received.iter().take(index(rows)).all(|&received| received == columns);
         if let Some(stored) = self.bands.get_mut(plane) {
             *stored = band;
         }
-        span?;
         if is_whole {
             self.write_means(row, piece.is_chroma, input);
         }

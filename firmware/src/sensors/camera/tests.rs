@@ -219,13 +219,13 @@ proptest! {
         for _ in 0..2 {
             let mut input = vec![UNTOUCHED; layout.map.elements() as usize];
             push(&image, &mut camera, &mut input, &[], &mut random);
-            prop_assert_eq!(camera.finish(), Ok(Status::Live));
+            prop_assert_eq!(camera.finish(), Ok(FrameStatus::Live));
             prop_assert_eq!(&input, &image.expected(|_| true));
         }
         let mut input = vec![UNTOUCHED; layout.map.elements() as usize];
         let image = Image::new(layout, padding, &mut random);
         camera.push_image(&image.bytes, image.stride as u32, &mut input).unwrap();
-        prop_assert_eq!(camera.finish(), Ok(Status::Live));
+        prop_assert_eq!(camera.finish(), Ok(FrameStatus::Live));
         prop_assert_eq!(&input, &image.expected(|_| true));
     }
 
@@ -242,7 +242,7 @@ proptest! {
         let top = camera.top as usize;
         let found = camera.finish();
         match missing.first() {
-            None => prop_assert_eq!(found, Ok(Status::Live)),
+            None => prop_assert_eq!(found, Ok(FrameStatus::Live)),
             Some(first) => {
                 let first = (top + (first << layout.scale.bits())) as u16;
                 prop_assert_eq!(found, Err(MissingRows { count: missing.len() as u16, first }));
@@ -327,17 +327,22 @@ fn equal_frames_in_a_row_are_a_frozen_camera() {
     };
     assert_eq!(
         [(); 4].map(|()| frame(&image)),
-        [Ok(Status::Live), Ok(Status::Live), Ok(Status::Frozen { repeats: 2 }), Ok(Status::Frozen { repeats: 3 }),]
+        [
+            Ok(FrameStatus::Live),
+            Ok(FrameStatus::Live),
+            Ok(FrameStatus::Frozen { repeats: 2 }),
+            Ok(FrameStatus::Frozen { repeats: 3 }),
+        ]
     );
     // Row 1 and column 2 begin the crop; what lies outside does not count.
     image.bytes[0] ^= 1;
-    assert_eq!(frame(&image), Ok(Status::Frozen { repeats: 4 }));
+    assert_eq!(frame(&image), Ok(FrameStatus::Frozen { repeats: 4 }));
     image.bytes[8 * 3 + 2 * 3] ^= 1;
-    assert_eq!(frame(&image), Ok(Status::Live));
+    assert_eq!(frame(&image), Ok(FrameStatus::Live));
     // Two pixels that change places are another image.
     let at = 8 * 3 + 2 * 3;
     image.bytes[at..at + 6].rotate_left(3);
-    assert_eq!(frame(&image), Ok(Status::Live));
+    assert_eq!(frame(&image), Ok(FrameStatus::Live));
 }
 
 #[test]
@@ -350,10 +355,10 @@ fn a_frame_with_lost_rows_is_not_compared() {
         rows.for_each(|row| camera.push(row, 0, &[5; 24], &mut input).unwrap());
         camera.finish()
     };
-    assert_eq!(frame(0..6), Ok(Status::Live));
+    assert_eq!(frame(0..6), Ok(FrameStatus::Live));
     assert_eq!(frame(0..4), Err(MissingRows { count: 1, first: 4 }));
     assert_eq!(frame(0..0), Err(MissingRows { count: 4, first: 1 }));
-    assert_eq!(frame(0..6), Ok(Status::Frozen { repeats: 1 }));
+    assert_eq!(frame(0..6), Ok(FrameStatus::Frozen { repeats: 1 }));
 }
 
 #[test]
@@ -367,6 +372,28 @@ fn rows_of_one_crop_row_that_come_apart_are_missing() {
     }
     assert_eq!(camera.finish(), Err(MissingRows { count: 2, first: 0 }));
     assert_eq!(input, [UNTOUCHED; 12]);
+}
+
+#[test]
+fn frames_become_readings_of_the_driver() {
+    assert_eq!(Reading::from(Ok(FrameStatus::Live)), Reading::now(()));
+    assert_eq!(Reading::from(Ok(FrameStatus::Frozen { repeats: 2 })), Reading::Frozen);
+    assert_eq!(Reading::from(Err(MissingRows { count: 1, first: 0 })), Reading::Missing);
+}
+
+#[test]
+fn a_refused_piece_leaves_the_sums_under_way() {
+    let layout = CameraLayout { scale: Scale::Half, map: Shape::map(2, 2, 3), ..small(PixelFormat::Rgb) };
+    let mut memory = vec![0; layout.memory_words()];
+    let mut camera = Camera::new(layout, &mut memory).unwrap();
+    let mut input = [UNTOUCHED; 12];
+    camera.push(0, 0, &[200; 24], &mut input).unwrap();
+    // Of another row of the crop: one piece begins too far to the right, one ends before the crop begins.
+    let refused = camera.push(2, 12, &[7; 12], &mut input);
+    assert_eq!(refused, Err(CameraError::Gap { row: 2, expected: 2, found: 4 }));
+    assert_eq!(camera.push(2, 0, &[7; 6], &mut input), Ok(()));
+    camera.push(1, 0, &[100; 24], &mut input).unwrap();
+    assert_eq!((&input[..6], &input[6..]), (&[22; 6][..], &[UNTOUCHED; 6][..]));
 }
 
 #[test]

@@ -1,10 +1,11 @@
 //! Points to a bird's-eye-view histogram: two channels (up to and above a height) of counts 0..=5.
 //!
-//! Rows are lateral: from 32 m on the right to 33 m on the left. Columns are longitudinal: from 32 m ahead (column 0) to
-//! the sensor (last column). Numbers of bins are powers of two; the published networks have 256 × 256 bins of
+//! Rows are lateral: from 32 m on the right to 33 m on the left. Columns are longitudinal: from 32 m ahead (column 0)
+//! to the sensor (last column). Numbers of bins are powers of two; the published networks have 256 × 256 bins of
 //! 65/256 m × 0.125 m. Bins are half-open, the last one of each axis is closed, and points outside are left out.
 
 use super::Point;
+use crate::drive::Reading;
 use crate::sensors::{InputSize, NotFinite};
 use crate::tensor::{Shape, index};
 use core::fmt;
@@ -107,8 +108,19 @@ pub struct Statistics {
     pub saturated: u32,
 }
 
-/// A histogram that grows point by point in the network's input. A frame that ends before [`Self::finish`] leaves counts
-/// of the points so far.
+/// What the driver is to know of a sweep that ended in this step.
+impl From<Statistics> for Reading<()> {
+    fn from(Statistics { points, not_finite, .. }: Statistics) -> Self {
+        match points {
+            0 => Self::Missing,
+            _ if points == not_finite => Self::NotANumber,
+            _ => Self::now(()),
+        }
+    }
+}
+
+/// A histogram that grows point by point in the network's input. A frame that ends before [`Self::finish`] leaves
+/// counts of the points so far.
 #[derive(Debug)]
 pub struct Sweep<'a> {
     histogram: Histogram,
@@ -167,6 +179,20 @@ mod tests {
         let element = histogram.element(Mounting::TRAINED.place(point.map(f32::to_bits)).unwrap())?;
         let width = u32::from(histogram.shape.width);
         Some((element / 2 / width, element / 2 % width, element % 2))
+    }
+
+    #[test]
+    fn a_sweep_without_points_is_a_missing_sensor() {
+        let mut counts = vec![0; Histogram::TRANSFUSER.shape().elements() as usize];
+        let mut reading = |points: &[Result<Point, NotFinite>]| {
+            let mut sweep = Sweep::new(Histogram::TRANSFUSER, &mut counts).unwrap();
+            points.iter().for_each(|&point| sweep.push(point));
+            Reading::from(sweep.finish())
+        };
+        let far = Mounting::TRAINED.place([1e4_f32.to_bits(); 3]);
+        assert_eq!(reading(&[]), Reading::Missing);
+        assert_eq!(reading(&[Err(NotFinite); 3]), Reading::NotANumber);
+        assert_eq!(reading(&[Err(NotFinite), far]), Reading::now(()), "an empty street is no fault");
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! Motion of the vehicle between the capture of a point and now.
 
 use super::Point;
+use crate::drive::Real;
+use crate::drive::trigonometry::unit_vector;
 use crate::fixed_point::{round_shift, saturate_i32};
 use core::fmt;
 use fixed::types::I16F16;
@@ -8,8 +10,9 @@ use fixed::types::I16F16;
 /// Fraction bits of sines and cosines.
 const UNIT_BITS: u32 = 30;
 const UNIT: i32 = 1 << UNIT_BITS;
-/// Largest deviation of `cos² + sin²` from 1, in Q60: both rounded to the nearest deviate by less than √2·2^30.
-const MAX_DEVIATION: u64 = 1 << 31;
+/// Largest deviation of `cos² + sin²` from 1, in Q60: 2^-26. Sine and cosine of the drive layer lie within
+/// 2^-27.5 of the real ones, which makes at most 2√2·2^-27.5.
+const MAX_DEVIATION: u64 = 1 << 34;
 
 /// Cosine and sine of a compass reading (0 north, clockwise), Q30.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -18,7 +21,7 @@ pub struct Heading {
     sin: i32,
 }
 
-/// Cosine and sine do not belong to one angle: their squares do not sum to 1 within 2^-29.
+/// Cosine and sine do not belong to one angle: their squares do not sum to 1 within 2^-26.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct NoRotation {
@@ -40,10 +43,16 @@ impl Heading {
     /// Facing north.
     pub const NORTH: Self = Self { cos: UNIT, sin: 0 };
 
-    /// Cosine and sine in Q30.
+    /// Of a compass reading in radians, 0 north and clockwise, as the drive layer takes it.
+    pub fn from_compass(radians: Real) -> Self {
+        let (sine, cosine) = unit_vector(radians);
+        Self { cos: cosine.to_bits(), sin: sine.to_bits() }
+    }
+
+    /// Cosine and sine in Q30, of a sensor that gives those.
     ///
     /// # Errors
-    /// Their squares do not sum to 1 within 2^-29.
+    /// Their squares do not sum to 1 within 2^-26.
     pub const fn new(cos: i32, sin: i32) -> Result<Self, NoRotation> {
         // Each square is at most 2^62.
         let square = (cos as i64).wrapping_mul(cos as i64).wrapping_add((sin as i64).wrapping_mul(sin as i64));
@@ -68,9 +77,9 @@ pub struct Pose {
 /// Brings a point of the frame of its capture into the current one: `p' = R·p + t` on the ground plane, z unchanged.
 ///
 /// With Δ = capture's compass − current compass and d = capture's position − current position:
-/// `left' = left·cos Δ − forward·sin Δ + t_left`, `forward' = left·sin Δ + forward·cos Δ + t_forward`, where t is d seen
-/// by the current frame. This is `M₂⁻¹·M₁·p` of the published data preparation in its axes (right, backward); there it
-/// was written for points whose x grows to the right. Networks of one LiDAR frame are trained without motion.
+/// `left' = left·cos Δ − forward·sin Δ + t_left`, `forward' = left·sin Δ + forward·cos Δ + t_forward`, where t is d
+/// seen by the current frame. This is `M₂⁻¹·M₁·p` of the published data preparation in its axes (right, backward);
+/// there it was written for points whose x grows to the right. Networks of one LiDAR frame are trained without motion.
 ///
 /// No motion is exact, and keeps the odd codes of [`Point`]. Otherwise a coordinate lies within 2^-14 m (61 µm) of the
 /// real one for points and motions of up to 128 m; results saturate at ±32768 m.
@@ -116,7 +125,8 @@ impl Motion {
     }
 }
 
-/// `R(a₀·b₀ + a₁·b₁, 30)`: below 2^62 in magnitude before the shift, since no b exceeds 2^30 by more than rounding.
+/// `R(a₀·b₀ + a₁·b₁, 30)`: below 2^62 in magnitude before the shift, since no b
+/// exceeds 2^30 by more than rounding.
 fn sum_of_products(a: [i32; 2], b: [i32; 2]) -> i32 {
     let [first, second] = [0, 1].map(|i| {
         let pair = a.get(i).zip(b.get(i));
@@ -129,6 +139,7 @@ fn sum_of_products(a: [i32; 2], b: [i32; 2]) -> i32 {
 mod tests {
     extern crate std;
     use super::*;
+    use crate::image::known_answer::Generator;
     use proptest::prelude::*;
 
     fn heading(angle: f64) -> Heading {
@@ -162,11 +173,28 @@ mod tests {
     }
 
     #[test]
+    fn every_compass_gives_a_heading() {
+        let seed = 3;
+        let mut generator = Generator::new(seed);
+        let mut worst = 0;
+        for _ in 0..100_000 {
+            let compass = Real::from_bits((generator.draw() >> (generator.draw() % 34)).cast_signed());
+            let Heading { cos, sin } = Heading::from_compass(compass);
+            assert_eq!(Heading::new(cos, sin), Ok(Heading { cos, sin }), "seed {seed}, {compass} rad");
+            let [cos, sin] = [cos, sin].map(i64::from);
+            worst = worst.max((cos * cos + sin * sin - (1 << (2 * UNIT_BITS))).unsigned_abs());
+        }
+        std::println!("largest deviation of cos² + sin² from 1: 2^{:.1}", (worst as f64).log2() - 60.0);
+        assert_eq!(Heading::from_compass(Real::ZERO), Heading::NORTH);
+    }
+
+    #[test]
     fn numbers_that_are_no_cosine_and_sine_are_refused() {
-        for (cos, sin) in [(0, 0), (UNIT, UNIT), (i32::MIN, i32::MIN), (i32::MAX, 0), (UNIT - 4, 0)] {
+        for (cos, sin) in [(0, 0), (UNIT, UNIT), (i32::MIN, i32::MIN), (i32::MAX, 0), (UNIT - 9, 0)] {
             assert_eq!(Heading::new(cos, sin), Err(NoRotation { cos, sin }));
         }
         assert_eq!(Heading::new(UNIT, 0), Ok(Heading::NORTH));
+        assert!(Heading::new(UNIT - 8, 0).is_ok());
     }
 
     proptest! {
@@ -187,7 +215,8 @@ mod tests {
             forward in -128.0..128.0_f64,
         ) {
             let bits = [left as f32, forward as f32, 0.0].map(f32::to_bits);
-            let moved = Motion::between(&pose(first), &pose(second)).apply(super::super::Mounting::TRAINED.place(bits).unwrap());
+            let point = super::super::Mounting::TRAINED.place(bits).unwrap();
+            let moved = Motion::between(&pose(first), &pose(second)).apply(point);
             // The published axes: x to the right, y backward.
             let [x, y] = published(first, second, [-left, -forward]);
             let error = |found: I16F16, expected: f64| (found.to_num::<f64>() - expected).abs();
