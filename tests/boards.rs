@@ -3,9 +3,10 @@
 use firmware::image::Image;
 use model_compiler::emit::AlignedBytes;
 use model_compiler::frames::{self, FrameFormat};
-use model_compiler::import::{ImportOptions, System};
+use model_compiler::import::{ImportOptions, System, import};
+use model_compiler::ir::Graph;
 use model_compiler::memory_plan::PlanOptions;
-use model_compiler::passes::PassOptions;
+use model_compiler::passes::{PassOptions, optimize};
 use model_compiler::pipeline;
 use model_compiler::quantize::QuantizeOptions;
 use model_compiler::target::Target;
@@ -21,6 +22,14 @@ fn bundled() -> Vec<u8> {
     let model = pipeline::quantize_graph(&graph, &frames, &QuantizeOptions::default(), &mut |_, _, _| {}).unwrap();
     let target = Target::find("cortex-m4").unwrap();
     pipeline::compile(&model, &target, &PlanOptions::for_target(&target), &mut |_, _, _| {}).unwrap().image
+}
+
+/// A small network at its own resolution, which fits a microcontroller's RAM.
+fn small(network: &Network) -> Graph {
+    let options = ImportOptions { resolution: Some(network.resolution()), ..Default::default() };
+    let mut graph = import("network", network.tensors(), &options).unwrap();
+    optimize(&mut graph).unwrap();
+    graph
 }
 
 fn steps(image: &[u8]) -> usize {
@@ -49,7 +58,7 @@ fn every_system_gives_its_known_answer_on_the_cortex_m4() {
     for system in System::ALL {
         let graph = match system {
             System::Lbc => build::lbc(&Lbc::small(), false),
-            _ => build::small(&Network::small(system)),
+            _ => small(&Network::small(system)),
         };
         let model = build::quantized(&graph, &QuantizeOptions::default());
         let image = build::compiled_for(&model, "cortex-m4").image;
