@@ -96,7 +96,9 @@ fn run_prints_waypoints_of_image_and_checkpoint() {
     }
     // What the table shows is what the document holds.
     let row: Vec<&str> = text.lines().find(|l| l.contains("inputs#1")).unwrap().split_whitespace().skip(1).collect();
-    assert_eq!(row, waypoints(&int8, 1).iter().map(|m| format!("{m:.3}")).collect::<Vec<_>>());
+    let controls = ["steer", "throttle", "brake"].map(|name| int8["frames"][1]["controls"][name].as_f64().unwrap());
+    let shown: Vec<f64> = waypoints(&int8, 1).into_iter().chain(controls).collect();
+    assert_eq!(row, shown.iter().map(|value| format!("{value:.3}")).collect::<Vec<_>>());
 }
 
 #[test]

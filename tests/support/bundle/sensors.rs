@@ -50,6 +50,7 @@ impl Recording {
             rgb: Some(ByteMap { shape: Shape::map(SIDE, SIDE, 3), data: self.rgb.clone() }),
             bev: Some(bev),
             velocity: Some(self.speed),
+            speed: Some(self.speed),
             goal: Some([self.goal[0], 0.0 - self.goal[1]]),
             command: Some(COMMAND),
             dropped_points,
