@@ -60,6 +60,8 @@ pub enum EngineError {
         /// Bytes of the tensor.
         expected: u32,
     },
+    /// The network has no input of this index.
+    NoSuchInput(u32),
     /// `step` or `self_test_step` without a `start` before it.
     NotStarted,
     /// An output was asked for before the last step was done.
@@ -98,6 +100,7 @@ impl fmt::Display for EngineError {
             Self::InputBytes { input, found, expected } => {
                 write!(f, "input {input}: {found} bytes given, expected {expected}")
             }
+            Self::NoSuchInput(index) => write!(f, "the network has no input {index}"),
             Self::NotStarted => write!(f, "no inference was started"),
             Self::NotDone => write!(f, "the inference is not done"),
             Self::NoSuchOutput(index) => write!(f, "the network has no output {index}"),
@@ -184,8 +187,26 @@ impl<'a, K: Kernels> Engine<'a, K> {
             }
             slot.copy_from_slice(given);
         }
-        self.progress = Some(Progress::Running { next: 0 });
+        self.begin();
         Ok(())
+    }
+
+    /// The bytes of an input, to be filled in place as a sensor delivers; [`Self::begin`] then starts without a copy.
+    /// Abandons an inference that is under way. Inputs keep their bytes until the next inference begins, which
+    /// overwrites them: each must be filled anew for every inference.
+    ///
+    /// # Errors
+    /// [`EngineError::NoSuchInput`], [`EngineError::ImageChanged`].
+    pub fn input_mut(&mut self, input: usize) -> Result<&mut [u8], EngineError> {
+        self.progress = None;
+        let missing = EngineError::NoSuchInput(u32::try_from(input).unwrap_or(u32::MAX));
+        let number = u8::try_from(input).ok().filter(|number| *number < self.image.input_count()).ok_or(missing)?;
+        self.input_slot(number)
+    }
+
+    /// Begins an inference over what was written to the inputs ([`Self::input_mut`]).
+    pub fn begin(&mut self) {
+        self.progress = Some(Progress::Running { next: 0 });
     }
 
     /// Runs the next step to its end; after the last one it does nothing and answers `Done` again.
@@ -283,7 +304,7 @@ impl<'a, K: Kernels> Engine<'a, K> {
             let element = self.image.tensor(port.tensor).ok_or(changed)?.element;
             generator.fill(element, self.input_slot(input)?);
         }
-        self.progress = Some(Progress::Running { next: 0 });
+        self.begin();
         Ok(())
     }
 
