@@ -83,14 +83,14 @@ fn sense(raw: &Raw<'_>) -> Option<()> {
     let points = || raw.points.iter().map(|&bits| mounting.place(bits).map(|point| motion.apply(point)));
     let histogram = Histogram::new(raw.layout?.map, raw.split).ok()?;
     for histogram in [Histogram::TRANSFUSER, Histogram::BASELINES, histogram] {
-        let mut sweep = Sweep::new(histogram, black_box(&mut map)).ok()?;
-        black_box(&mut sweep).clear();
-        points().for_each(|point| sweep.push(point));
+        let mut sweep = Sweep::new(histogram);
+        black_box(&mut sweep).start(black_box(&mut map)).ok()?;
+        points().for_each(|point| sweep.push(point, black_box(&mut map)));
         black_box(sweep.finish());
     }
-    let mut cells = Correspondences::new(raw.intrinsics?, black_box(&mut map), black_box(&mut other)).ok()?;
-    black_box(&mut cells).clear();
-    points().for_each(|point| cells.push(point));
+    let mut cells = Correspondences::new(raw.intrinsics?);
+    black_box(&mut cells).start(black_box(&mut map), black_box(&mut other)).ok()?;
+    points().for_each(|point| cells.push(point, black_box(&mut map), black_box(&mut other)));
     black_box(cells.finish());
 
     let [a, b, c] = raw.numbers;
