@@ -214,10 +214,19 @@ impl<'a, K: Kernels> Engine<'a, K> {
     /// # Errors
     /// [`EngineError::NotStarted`]; [`EngineError::ImageChanged`], after which the inference must be started anew.
     pub fn step(&mut self) -> Result<Progress, EngineError> {
-        match self.progress.ok_or(EngineError::NotStarted)? {
-            Progress::Running { next } => self.run(next).map(|_| self.progress.unwrap_or(Progress::Done)),
-            Progress::Done => Ok(Progress::Done),
+        self.step_observed(|_, _, _| ())
+    }
+
+    /// As [`Self::step`]; `observe` sees the step with its position and output bytes right after it ran.
+    ///
+    /// # Errors
+    /// As [`Self::step`].
+    pub fn step_observed(&mut self, observe: impl FnOnce(usize, &Step, &[u8])) -> Result<Progress, EngineError> {
+        if let Progress::Running { next } = self.progress.ok_or(EngineError::NotStarted)? {
+            let step = self.run(next)?;
+            observe(next.into(), &step, self.written(next, &step)?);
         }
+        self.progress.ok_or(EngineError::NotStarted)
     }
 
     /// A whole inference.
@@ -238,10 +247,7 @@ impl<'a, K: Kernels> Engine<'a, K> {
         mut observe: impl FnMut(usize, &Step, &[u8]),
     ) -> Result<(), EngineError> {
         self.start(inputs)?;
-        while let Some(Progress::Running { next }) = self.progress {
-            let step = self.run(next)?;
-            observe(next.into(), &step, self.written(next, &step)?);
-        }
+        while self.step_observed(&mut observe)? != Progress::Done {}
         Ok(())
     }
 

@@ -69,6 +69,7 @@ pub mod layout;
 mod parse;
 mod records;
 
+pub(crate) use checker::crc32_digest;
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
 pub use checks::{Check, ParseError, Place};
 pub(crate) use checks::{ensure, ensure_equal, shown};

@@ -56,6 +56,7 @@
 #[cfg(not(target_endian = "little"))]
 compile_error!("model images are little-endian and executed in place");
 
+pub mod actuators;
 pub mod arena;
 #[cfg(any(test, feature = "conformance"))]
 pub mod conformance;
@@ -65,6 +66,7 @@ pub mod fault;
 pub mod fixed_point;
 pub mod image;
 pub mod kernels;
+pub mod link;
 pub mod ops;
 pub mod program;
 pub mod sensors;

@@ -11,6 +11,11 @@ pub fn crc32(bytes: &[u8]) -> u32 {
     CRC.checksum(bytes)
 }
 
+/// The CRC-32 of bytes that come one after the other.
+pub(crate) fn crc32_digest() -> Digest<'static, u32, Table<1>> {
+    CRC.digest()
+}
+
 /// A section is damaged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
