@@ -70,6 +70,8 @@ mod parse;
 mod records;
 
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
+#[cfg(any(test, feature = "conformance"))]
+pub(crate) use checker::{Digest, digest};
 pub use checks::{Check, ParseError, Place};
 pub(crate) use checks::{ensure, ensure_equal, shown};
 pub use known_answer::KnownAnswer;

@@ -1,4 +1,5 @@
 //! The programs that run on a board. Each answers the exit status: 0 right, 1 wrong.
 
 pub mod check;
+pub mod conformance;
 pub mod self_test;
