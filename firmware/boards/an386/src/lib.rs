@@ -20,8 +20,8 @@ static mut ARENA: Arena<ARENA_BYTES> = Arena([0; ARENA_BYTES]);
 /// The program runs on this board, and calls this once.
 pub unsafe fn board() -> Board<CmsdkUart, CmsdkTimer, Portable> {
     // SAFETY: this is an MPS2 board, its devices are made once, and nothing here writes its PSRAM.
-    let (machine, image) = unsafe { (mps2::machine("an386"), image_memory::stored(PSRAM, PSRAM_BYTES)) };
+    let (machine, (image, behind)) = unsafe { (mps2::machine("an386"), image_memory::stored(PSRAM, PSRAM_BYTES)) };
     // SAFETY: the only reference ever, since this is called once.
     let arena = unsafe { &mut *&raw mut ARENA };
-    Board { machine, image, kernels: Portable, arena: &mut arena.0 }
+    Board { machine, image, behind, kernels: Portable, arena: &mut arena.0 }
 }

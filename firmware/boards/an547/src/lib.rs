@@ -26,7 +26,7 @@ pub unsafe fn board() -> Board<CmsdkUart, SystemCounter, Portable> {
     let (uart, counter) = unsafe { (CmsdkUart::new(UART), SystemCounter::new(COUNTER, COUNTER_HERTZ)) };
     // SAFETY: both ranges are DDR of the board, apart from each other and from what the linker uses; any bytes are
     // valid, no other reference to them exists, and nothing writes the image's.
-    let (image, arena) =
+    let ((image, behind), arena) =
         unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
-    Board { machine: Machine { name: "an547", uart, counter }, image, kernels: Portable, arena }
+    Board { machine: Machine { name: "an547", uart, counter }, image, behind, kernels: Portable, arena }
 }

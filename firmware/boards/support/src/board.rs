@@ -9,6 +9,8 @@ pub struct Board<U, C, K> {
     pub machine: Machine<U, C>,
     /// The model image, as its memory holds it; nothing of it is checked.
     pub image: &'static [u8],
+    /// The memory behind it.
+    pub behind: &'static [u8],
     /// Backend of the board's core.
     pub kernels: K,
     /// Memory for the engine.

@@ -70,7 +70,7 @@ pub unsafe fn board() -> Board<Pl011, GenericTimer, Portable> {
     let uart = unsafe { Pl011::new(UART) };
     // SAFETY: both ranges are RAM of the board, apart from each other and from what the linker uses; any bytes are
     // valid, no other reference to them exists, and nothing writes the image's.
-    let (image, arena) =
+    let ((image, behind), arena) =
         unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
-    Board { machine: Machine { name: "virt", uart, counter: GenericTimer }, image, kernels: Portable, arena }
+    Board { machine: Machine { name: "virt", uart, counter: GenericTimer }, image, behind, kernels: Portable, arena }
 }

@@ -24,7 +24,7 @@ pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -
 }
 
 fn test<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -> fmt::Result {
-    let Board { machine, image: bytes, kernels, arena } = board;
+    let Board { machine, image: bytes, kernels, arena, .. } = board;
     let board = machine.name;
     let image = say(machine, Image::parse(bytes))?;
     writeln!(
