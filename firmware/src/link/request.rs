@@ -113,10 +113,11 @@ impl Default for Configuration {
     fn default() -> Self {
         let camera =
             CameraSetup { width: 400, height: 300, format: PixelFormat::Rgb, scale: Scale::Full, frozen_after: 40 };
+        const HEIGHT: I16F16 = I16F16::lit("2.5");
         Self {
             camera,
             lidar_axes: Axes::Carla,
-            lidar_height: I16F16::lit("2.5"),
+            lidar_height: HEIGHT,
             budget_ms: STEP_MS.into(),
             silence_ms: u32::from(STEP_MS).saturating_mul(4),
             needs_self_test: true,

@@ -1,11 +1,13 @@
 //! Links only if no panic is reachable: the panic handler calls a symbol that nothing defines, so that one reachable
-//! panic is a link error. What is linked is what drives: parse, check, inference, self-test, waypoints, every sensor
-//! and the driver of all systems.
+//! panic is a link error. What is linked is what drives: parse, check, inference, self-test, waypoints, every sensor,
+//! the driver of all systems, and the computer that decodes what comes over a line.
 //!
 //! The program is not meant to run. Each `twin-*` feature adds one panic of a usual kind at the end of a chain and must
 //! not link: so it shows, too, that the optimizer did not see the end of the chain as unreachable.
 #![no_std]
 #![no_main]
+
+mod computer;
 
 use core::hint::black_box;
 use core::panic::PanicInfo;
@@ -36,6 +38,7 @@ pub extern "C" fn start() -> bool {
     infer(black_box(&[]), black_box(&mut arena), black_box(&[])).is_some()
         & sense(black_box(&Raw::default())).is_some()
         & drive(black_box(&Trip::default()))
+        & computer::compute(black_box(&[]), black_box(&mut arena))
 }
 
 fn infer(image: &[u8], arena: &mut [u8], inputs: &[&[u8]]) -> Option<()> {
