@@ -31,6 +31,7 @@
 
 mod desk;
 mod line;
+mod log;
 mod network;
 mod rig;
 mod self_test;
@@ -198,7 +199,7 @@ fn start<'i, B: Board>(image: &'i [u8], board: &mut B) -> Result<(Image<'i>, Sta
         board.feed_watchdog();
     }
     let times = StartTimes { parse: parsed.wrapping_sub(begin), check: board.ticks().wrapping_sub(parsed) };
-    log_start(board, &image, times);
+    log::started(board.name(), &image, times);
     Ok((image, times))
 }
 
@@ -211,7 +212,7 @@ fn stop<A: Actuate>(actuators: &mut A) {
 
 /// Without an image there is only one answer.
 fn refuse_all<B: Board>(error: StartError, line: &mut Line, board: &mut B) -> Exit {
-    log_error(board, error);
+    log::no_image(board.name(), error);
     let Line { receiver, sender } = line;
     loop {
         board.feed_watchdog();
@@ -227,20 +228,3 @@ fn refuse_all<B: Board>(error: StartError, line: &mut Line, board: &mut B) -> Ex
         sender.send(board, &Response::Refused { request, reason: Refusal::NoImage });
     }
 }
-
-#[cfg(feature = "defmt")]
-fn log_start<B: Board>(board: &B, image: &Image<'_>, times: StartTimes) {
-    defmt::info!("{=str}: image {=str}, {=usize} bytes", board.name(), image.name(), image.bytes().len());
-    defmt::info!("parse {=u64} ticks, check {=u64} ticks", times.parse, times.check);
-}
-
-#[cfg(not(feature = "defmt"))]
-fn log_start<B: Board>(_: &B, _: &Image<'_>, _: StartTimes) {}
-
-#[cfg(feature = "defmt")]
-fn log_error<B: Board>(board: &B, error: StartError) {
-    defmt::error!("{=str}: no image: {}", board.name(), error);
-}
-
-#[cfg(not(feature = "defmt"))]
-fn log_error<B: Board>(_: &B, _: StartError) {}

@@ -1,6 +1,7 @@
 //! Where requests are carried out.
 
 use super::line::{Order, Sender};
+use super::log;
 use super::network::{Network, network_output};
 use super::rig::{Rig, Sensed};
 use super::self_test::SelfTest;
@@ -99,9 +100,12 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
             self.board.wait();
             return;
         }
-        if self.test.advance(&mut self.engine).is_err() && self.last_end.is_some() {
-            let output = self.driver.halt(Fault::NetworkFailed);
-            self.finish(self.last_frame.unwrap_or(0), output, Answer::None, 0);
+        if let Err(reason) = self.test.advance(&mut self.engine) {
+            log::self_test_failed(reason);
+            if self.last_end.is_some() {
+                let output = self.driver.halt(Fault::NetworkFailed);
+                self.finish(self.last_frame.unwrap_or(0), output, Answer::None, 0);
+            }
         }
     }
 
@@ -167,6 +171,7 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
     }
 
     fn refuse(&mut self, request: u16, reason: Refusal) {
+        log::refused(request, reason);
         self.sender.send(self.board, &Response::Refused { request, reason });
     }
 
@@ -348,6 +353,7 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
         answer: Answer,
         network_ticks: u64,
     ) {
+        log::ended(frame, output.status, network_ticks);
         let telemetry = Telemetry {
             frame,
             status: output.status,
@@ -397,6 +403,7 @@ fn infer<K: Kernels, B: Board>(
         board.feed_watchdog();
         sender.take_in(board);
         if detail.steps && progress.is_ok() {
+            log::step(&report);
             sender.send(board, &Response::Step(report));
         }
         match progress {
