@@ -77,12 +77,12 @@ impl Board {
         self.check("self-test", image)
     }
 
-    /// Runs a check over an image; `None` where the program or the emulator is missing, which is said past the test's
+    /// Runs a check over an image and what lies behind it; `None` where the program or the emulator is missing, which is said past the test's
     /// capture.
     ///
     /// # Panics
     /// The image cannot be written or the emulator not started.
-    pub fn check(&self, check: &str, image: &[u8]) -> Option<Run> {
+    pub fn check(&self, check: &str, memory: &[u8]) -> Option<Run> {
         let program = self.program(Program::Check);
         if !program.exists() || !is_installed(self.emulator) {
             let _ = writeln!(
@@ -96,7 +96,7 @@ impl Board {
         }
         let folder = tempfile::tempdir().expect("a temporary folder");
         let file = folder.path().join("model.img");
-        fs::write(&file, image).expect("the image");
+        fs::write(&file, memory).expect("the image");
         let output = Command::new(self.emulator)
             .arg("-M")
             .args(self.machine)
