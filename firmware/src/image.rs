@@ -7,7 +7,7 @@
 //!
 //! | part | content | covered by |
 //! |---|---|---|
-//! | header, 384 bytes | magic, format, counts, features, name, digests, regions, section table | header CRC |
+//! | header, 384 bytes | magic, format, counts, features, name, target, revision, digests, regions, sections | header CRC |
 //! | ports | inputs, then outputs: tensor, zero point, scale (metadata), name; 32 bytes each | section CRC |
 //! | tensors | 32-byte records `{region, type, offset, bytes, dims, first_step, last_step, in_place_of}` | section CRC |
 //! | step index | first byte of every step in the program, `u32` each | section CRC |
@@ -179,6 +179,21 @@ impl<'a> Image<'a> {
 
     fn digest(&self, at: core::ops::Range<usize>) -> [u8; 32] {
         self.bytes.get(at).and_then(|field| field.try_into().ok()).unwrap_or_default()
+    }
+
+    /// Name of the target that the image was compiled for, empty where unknown.
+    pub fn target(&self) -> &'a str {
+        self.bytes.get(layout::header::TARGET).and_then(text).unwrap_or_default()
+    }
+
+    /// Revision of the model: what an update compares.
+    pub fn revision(&self) -> u32 {
+        bytes::u32_at(self.bytes, layout::header::REVISION).unwrap_or_default()
+    }
+
+    /// CRC-32 of the header. As the header holds the CRCs of all sections, it tells images apart.
+    pub fn header_crc(&self) -> u32 {
+        bytes::u32_at(self.bytes, layout::header::CRC).unwrap_or_default()
     }
 
     /// Union of the feature bits of all steps and kernels.
