@@ -69,6 +69,7 @@ pub mod layout;
 mod parse;
 mod records;
 
+pub(crate) use checker::Cursor;
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
 pub use checks::{Check, ParseError, Place};
 pub(crate) use checks::{ensure, ensure_equal, shown};
@@ -124,6 +125,15 @@ struct Section {
     offset: u32,
     length: u32,
     crc: u32,
+}
+
+impl Section {
+    /// The section's bytes in the file, with its padding.
+    fn padded(self, file: &[u8]) -> &[u8] {
+        let start = index(self.offset);
+        let end = start.saturating_add(index(self.length)).checked_next_multiple_of(layout::ALIGNMENT);
+        end.and_then(|end| file.get(start..end)).unwrap_or_default()
+    }
 }
 
 /// A parsed image: a view of the caller's bytes and a proof that [`Image::parse`] accepted them.
@@ -322,10 +332,7 @@ impl<'a> Image<'a> {
 
     /// The bytes of a section with its padding.
     fn padded_section(&self, kind: SectionKind) -> &'a [u8] {
-        let Section { offset, length, .. } = self.slot(kind);
-        let start = index(offset);
-        let end = start.saturating_add(index(length)).checked_next_multiple_of(layout::ALIGNMENT);
-        end.and_then(|end| self.bytes.get(start..end)).unwrap_or_default()
+        self.slot(kind).padded(self.bytes)
     }
 
     /// CRC-32 that the header records for a section.
