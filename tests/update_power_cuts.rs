@@ -8,7 +8,7 @@ use tests::device::{Device, image};
 use tests::nor_flash::{NorFlash, Operation};
 
 /// Seeds of how operations are torn; each cut is tried with every one.
-const SEEDS: Range<u64> = 1..5;
+const SEEDS: Range<u64> = 1..9;
 const ROOM: usize = 2 << 10;
 const PIECE: usize = 100;
 

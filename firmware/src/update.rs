@@ -73,11 +73,12 @@
 //! | 3, 5, 7 | confirmed: [`CONFIRMED`] | by [`Updater::confirm`] during that trial |
 //!
 //! Why this is enough: a slot with a claim runs only if its record is whole, so what a broken-off update left behind
-//! never runs; a claim that is torn or missing leaves an image that nothing has touched yet. A record is believed only
-//! with its CRC, and its image only after every byte of it was checked. Counters are compared as serial numbers, so that
-//! they may wrap. A trial counts when any bit of its mark is written, a confirmation only when all are: a mark torn by a
-//! power cut costs one trial, and the next start has another. A unit that cannot be read (an error-correcting code that
-//! a torn write left wrong) counts as written, but holds nothing.
+//! never runs; where the claim is torn or missing, the image is one that nothing has touched yet, or has lost its header
+//! (which the next update erases before it renews the claim). A record is believed only with its CRC, and its image only
+//! after every byte of it was checked. Counters are compared as serial numbers, so that they may wrap. A trial counts
+//! when any bit of its mark is written, a confirmation only when all are: a mark torn by a power cut costs one trial,
+//! and the next start has another. A unit that cannot be read (an error-correcting code that a torn write left wrong)
+//! counts as written, but holds nothing.
 //!
 //! # What an update refuses
 //!

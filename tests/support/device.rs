@@ -2,7 +2,7 @@
 
 use crate::nor_flash::NorFlash;
 use crate::random::Random;
-use firmware::image::{CheckProgress, Image, TensorRecord, crc32};
+use firmware::image::{CheckProgress, Image, TensorRecord, crc32, layout};
 use firmware::kernels::{Kernels, Portable};
 use firmware::program::{Clamp, Requant, Requantize, Step};
 use firmware::tensor::{ElementType, Shape, TensorId};
@@ -153,7 +153,7 @@ impl<const WRITE: usize, const ERASE: usize> Device<WRITE, ERASE> {
     }
 
     /// What is wrong with the flash, judged from its bytes alone: a record that tells of an image that is not there
-    /// whole, or half an image that would pass for the factory's. `known` are all images that were ever sent.
+    /// whole, or part of an image that would pass for the factory's. `known` are all images that were ever sent.
     pub fn lie(&self, known: &[&[u8]]) -> Option<String> {
         [Slot::A, Slot::B].into_iter().find_map(|slot| {
             let start = self.slots.image_offset(slot) as usize;
@@ -164,8 +164,8 @@ impl<const WRITE: usize, const ERASE: usize> Device<WRITE, ERASE> {
                     let told = known.iter().any(|image| image.len() == bytes as usize && stored.starts_with(image));
                     (!told).then(|| format!("{slot}: the record tells of {bytes} bytes that are no image"))
                 }
-                None if slot == Slot::A && !self.is_claimed(slot) && !whole => {
-                    Some(format!("{slot}: half an image without a claim"))
+                None if !self.is_claimed(slot) && !whole && stored.starts_with(&layout::MAGIC) => {
+                    Some(format!("{slot}: part of an image without a claim"))
                 }
                 None => None,
             }

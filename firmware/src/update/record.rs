@@ -120,8 +120,12 @@ impl Record {
     }
 }
 
-/// Makes the slot's image void, whatever is left of it.
+/// Makes the slot's image void, whatever is left of it. The image itself stays whole until there is a claim; what a
+/// broken-off update left is made unrecognizable before its claim is erased, or it could pass for the factory's.
 pub(super) fn claim<F: NorFlash>(flash: &mut F, slots: &Slots, slot: Slot) -> Result<(), FlashError> {
+    if Record::read(flash, slots, slot) == Record::Claimed {
+        flash::erase(flash, slots.first_sector(slot))?;
+    }
     flash::erase(flash, slots.record(slot))?;
     write_unit(flash, slots, slot, Unit::Claim, &CLAIM)
 }
@@ -168,4 +172,44 @@ fn read_unit<F: NorFlash>(flash: &mut F, slots: &Slots, slot: Slot, unit: Unit) 
     let bytes = buffer.get_mut(..slots.unit_bytes()).unwrap_or_default();
     let readable = flash::read(flash, slots.unit(slot, unit), bytes).is_ok();
     buffer.first_chunk().copied().filter(|_| readable).unwrap_or_default()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BODY: Body = Body { counter: 7, image_bytes: 4096, header_crc: 0x1234_5678 };
+
+    #[test]
+    fn a_body_is_read_back() {
+        assert_eq!(Body::from_bytes(&BODY.to_bytes()), Some(BODY));
+    }
+
+    #[test]
+    fn a_body_that_differs_in_one_bit_is_none() {
+        for bit in 0..8 * UNIT_BYTES {
+            let mut bytes = BODY.to_bytes();
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            assert_eq!(Body::from_bytes(&bytes), None, "bit {bit}");
+        }
+        assert_eq!(Body::from_bytes(&BLANK), None);
+        assert_eq!(Body::from_bytes(&[0; UNIT_BYTES]), None);
+    }
+
+    #[test]
+    fn counters_are_serial_numbers() {
+        let body = |counter| Body { counter, ..BODY };
+        for (older, newer) in [(0, 1), (u32::MAX, 0), (u32::MAX - 1, 1), (1 << 31, (1 << 31) + 1)] {
+            assert!(body(newer).is_newer_than(&body(older)), "{older}, {newer}");
+            assert!(!body(older).is_newer_than(&body(newer)), "{older}, {newer}");
+        }
+        assert!(!BODY.is_newer_than(&BODY));
+    }
+
+    #[test]
+    fn units_follow_each_other() {
+        let trials = (0..TRIALS).flat_map(|trial| [Unit::Tried(trial), Unit::Confirmed(trial)]);
+        let units = [Unit::Claim, Unit::Body].into_iter().chain(trials);
+        assert!(units.map(Unit::position).eq(0..UNITS as u32));
+    }
 }

@@ -211,3 +211,19 @@ impl fmt::Display for Refusal {
 }
 
 impl core::error::Error for Refusal {}
+
+#[cfg(test)]
+mod tests {
+    extern crate std;
+
+    use super::*;
+    use std::string::ToString;
+
+    #[test]
+    fn names_of_targets_are_shown_as_text() {
+        assert_eq!(TargetName::from("cortex-m4").to_string(), "cortex-m4");
+        assert_eq!(TargetName::from("").to_string(), "unknown");
+        assert_eq!(TargetName([0xFF; TARGET_BYTES]).to_string(), "illegible");
+        assert_eq!(TargetName::from("a-name-of-17-bytes").to_string(), "a-name-of-17-byt");
+    }
+}

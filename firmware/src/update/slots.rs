@@ -163,6 +163,11 @@ impl Slots {
         start..start.saturating_add(bytes.min(self.image_capacity()))
     }
 
+    /// The first sector of a slot's image.
+    pub(super) fn first_sector(&self, slot: Slot) -> Range<u32> {
+        self.image(slot, self.erase_size)
+    }
+
     /// The sector of a slot's image that starts with this byte of it, if one does.
     pub(super) fn sector(&self, slot: Slot, position: u32) -> Option<Range<u32>> {
         let start = self.image_offset(slot).saturating_add(position);
