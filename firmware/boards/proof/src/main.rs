@@ -1,6 +1,6 @@
 //! Links only if no panic is reachable: the panic handler calls a symbol that nothing defines, so that one reachable
 //! panic is a link error. What is linked is what drives: parse, check, inference, self-test, waypoints, every sensor,
-//! the driver of all systems, and the computer that decodes what comes over a line.
+//! the driver of all systems, the computer that decodes what comes over a line, and the update of the image.
 //!
 //! The program is not meant to run. Each `twin-*` feature adds one panic of a usual kind at the end of a chain and must
 //! not link: so it shows, too, that the optimizer did not see the end of the chain as unreachable.
@@ -8,6 +8,7 @@
 #![no_main]
 
 mod computer;
+mod update;
 
 use core::hint::black_box;
 use core::panic::PanicInfo;
@@ -21,6 +22,7 @@ use firmware::sensors::lidar::{Heading, Histogram, Motion, Mounting, Pose, Sweep
 use firmware::sensors::{heatmap, inputs};
 use firmware::waypoint::Waypoint;
 use fixed::types::I16F16;
+use update::Flash;
 
 unsafe extern "C" {
     safe fn a_panic_is_reachable() -> !;
@@ -39,6 +41,7 @@ pub extern "C" fn start() -> bool {
         & sense(black_box(&Raw::default())).is_some()
         & drive(black_box(&Trip::default()))
         & computer::compute(black_box(&[]), black_box(&mut arena))
+        & update::receive(black_box(Flash::default()), black_box(&[])).is_some()
 }
 
 fn infer(image: &[u8], arena: &mut [u8], inputs: &[&[u8]]) -> Option<()> {

@@ -9,6 +9,7 @@ pub mod board;
 pub mod counter;
 pub mod image_memory;
 pub mod machine;
+pub mod memory_flash;
 pub mod mps2;
 pub mod program;
 pub mod pwm;
