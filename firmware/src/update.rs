@@ -82,7 +82,7 @@
 //!
 //! # What an update refuses
 //!
-//! See [`Refusal`]: an image that is too large, for another target, with features, kernels or memory that the board does
+//! See [`Refusal`]: an image that is too large, for another target (neither the board's nor `portable`), with features, kernels or memory that the board does
 //! not have, with another interface than the application needs, with a lower revision than the running one's, or
 //! damaged. The same revision is accepted if the image differs (a rebuild); the very image that runs is refused, as
 //! there is nothing to do. Most of it is known from the [`Manifest`], before a sector is erased.

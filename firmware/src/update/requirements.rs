@@ -7,6 +7,9 @@ use crate::tensor::{ElementType, Shape};
 use core::fmt;
 use serde::{Deserialize, Serialize};
 
+/// The target whose images run wherever memory and kernels suffice.
+const PORTABLE: &str = "portable";
+
 /// The name of a target as an image carries it: up to 16 bytes of visible ASCII, padded with zeros.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
@@ -67,7 +70,7 @@ impl Manifest {
 /// What a board and its application need of an image.
 #[derive(Clone, Copy)]
 pub struct Requirements<'a> {
-    /// Name of the board's target; an image that names another one, or none, is foreign.
+    /// Name of the board's target; an image that names another one than this or `portable`, or none, is foreign.
     pub target: &'a str,
     /// Kernels of the backend ([`crate::kernels::Kernels::supported`]).
     pub kernels: &'a [KernelId],
@@ -95,7 +98,7 @@ impl Requirements<'_> {
     /// The first requirement that is not met.
     pub fn admit(&self, manifest: &Manifest) -> Result<(), Refusal> {
         let expected = TargetName::from(self.target);
-        if manifest.target != expected {
+        if manifest.target != expected && manifest.target != TargetName::from(PORTABLE) {
             return Err(Refusal::ForeignTarget { found: manifest.target, expected });
         }
         let unknown = manifest.features & !Step::KNOWN_FEATURES;
