@@ -1,6 +1,7 @@
-//! Tells the linker where this board's memory map lies.
+//! Tells the linker which script to follow and where this board's memory map lies.
 
 fn main() {
     println!("cargo::rustc-link-search={}", env!("CARGO_MANIFEST_DIR"));
+    println!("cargo::rustc-link-arg-bins=-Tlink.x");
     println!("cargo::rerun-if-changed=memory.x");
 }
