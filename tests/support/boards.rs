@@ -16,6 +16,8 @@ pub struct Board {
     machine: &'static [&'static str],
     /// Where the program looks for the image.
     image_address: u32,
+    /// By how much two equal counts of instructions may differ: the counter's tick may be no divisor of 64 ns.
+    pub counter_resolution: u64,
 }
 
 /// Every board.
@@ -26,6 +28,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps2-an386"],
         image_address: 0x2100_0000,
+        counter_resolution: 1,
     },
     Board {
         name: "an500",
@@ -33,6 +36,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps2-an500"],
         image_address: 0x6000_0000,
+        counter_resolution: 1,
     },
     Board {
         name: "an547",
@@ -40,6 +44,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps3-an547"],
         image_address: 0x6000_0000,
+        counter_resolution: 0,
     },
     Board {
         name: "virt",
@@ -47,6 +52,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-aarch64",
         machine: &["virt", "-cpu", "cortex-a72", "-m", "512M", "-nic", "none"],
         image_address: 0x5000_0000,
+        counter_resolution: 0,
     },
 ];
 

@@ -14,6 +14,7 @@ pub mod mps2;
 pub mod program;
 pub mod pwm;
 pub mod register;
+pub mod reset;
 pub mod semihosting;
 pub mod stack;
 pub mod uart;

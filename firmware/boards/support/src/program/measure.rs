@@ -5,7 +5,7 @@
 //! over the frames that lie behind the image. Each step prints the fewest and the most instructions that it took.
 //! Under `-icount shift=6` these are exact, up to one where the counter's tick is no divisor of 64 ns.
 
-use crate::board::Board;
+use crate::board::Bench;
 use crate::counter::Counter;
 use crate::machine::{Machine, say};
 use crate::stack::Mark;
@@ -55,12 +55,12 @@ enum Inputs<'a> {
 }
 
 /// Measures and answers the exit status: 0 measured, 1 the image or a step was refused.
-pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -> u8 {
-    u8::from(measure(board).is_err())
+pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> u8 {
+    u8::from(measure(bench).is_err())
 }
 
-fn measure<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -> fmt::Result {
-    let Board { machine, image: bytes, behind, kernels, arena } = board;
+fn measure<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> fmt::Result {
+    let Bench { machine, image: bytes, behind, kernels, arena } = bench;
     let name = machine.name;
     let mark = Mark::new();
     let (parsed, parse_ticks) = timed(machine, || parse(bytes));
