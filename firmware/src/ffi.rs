@@ -43,7 +43,7 @@
 )]
 
 use crate::engine::{Engine, EngineError, Progress};
-use crate::image::layout::MAX_PORTS;
+use crate::image::layout::{self, MAX_PORTS};
 use crate::image::{Image, Port};
 use crate::kernels::Portable;
 use core::ffi::{c_char, c_void};
@@ -91,8 +91,25 @@ pub extern "C" fn fw_version() -> *const c_char {
 /// What a status means, in a few words; of any other number: "unknown status".
 #[unsafe(no_mangle)]
 pub extern "C" fn fw_status_text(status: i32) -> *const c_char {
-    let known = Status::ALL.into_iter().find(|known| *known as i32 == status);
+    let known = status::ALL.into_iter().find(|known| *known as i32 == status);
     known.map_or(c"unknown status", Status::words).as_ptr()
+}
+
+/// How long the image is that begins at `memory`, of which `capacity` bytes can be read: for an image in flash whose
+/// length is known to its header alone.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn fw_image_length(memory: *const c_void, capacity: usize, bytes: *mut usize) -> Status {
+    let measure = || {
+        let (memory, bytes) = (place(memory, capacity)?, result(bytes)?);
+        // SAFETY: the caller vouches for the bytes; they are not used after this call.
+        let memory = unsafe { self::memory(memory) };
+        let length = layout::stated_length(memory).filter(|length| *length <= capacity);
+        let length = length.ok_or(Status::ImageMalformed)?;
+        // SAFETY: `result` has checked what can be; the caller vouches for the rest.
+        unsafe { bytes.write(length) };
+        Ok(())
+    };
+    answer(measure())
 }
 
 /// Whether the bytes at `image` (aligned to 16) are a model image that this library can run, and what it asks for.

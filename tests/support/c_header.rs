@@ -8,7 +8,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// Names in C of what Rust calls otherwise.
-const NAMES: [(&str, &str); 16] = [
+const NAMES: [(&str, &str); 15] = [
     ("Status", "fw_status"),
     ("EngineStorage", "fw_engine"),
     ("Region", "fw_region"),
@@ -24,7 +24,6 @@ const NAMES: [(&str, &str); 16] = [
     ("MAX_WAYPOINTS", "FW_MAX_WAYPOINTS"),
     ("MODEL_NAME_BYTES", "FW_MODEL_NAME_BYTES"),
     ("PORT_NAME_BYTES", "FW_PORT_NAME_BYTES"),
-    ("STATUS_COUNT", "FW_STATUS_COUNT"),
 ];
 
 /// The stored header.

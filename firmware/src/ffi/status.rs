@@ -54,33 +54,33 @@ pub enum Status {
     WrongAnswer = 21,
 }
 
-impl Status {
-    /// All codes in order of their numbers.
-    pub const ALL: [Self; 22] = [
-        Self::Ok,
-        Self::NullPointer,
-        Self::Misaligned,
-        Self::WrongSize,
-        Self::Overlap,
-        Self::NotInitialized,
-        Self::RegionCount,
-        Self::RegionTooSmall,
-        Self::ImageMalformed,
-        Self::ImageUnsupported,
-        Self::ImageDamaged,
-        Self::ImageChanged,
-        Self::KernelMissing,
-        Self::InputCount,
-        Self::InputBytes,
-        Self::NoSuchPort,
-        Self::NotStarted,
-        Self::NotDone,
-        Self::NoWaypoints,
-        Self::TooShort,
-        Self::NoKnownAnswer,
-        Self::WrongAnswer,
-    ];
+/// All codes in order of their numbers.
+pub(super) const ALL: [Status; 22] = [
+    Status::Ok,
+    Status::NullPointer,
+    Status::Misaligned,
+    Status::WrongSize,
+    Status::Overlap,
+    Status::NotInitialized,
+    Status::RegionCount,
+    Status::RegionTooSmall,
+    Status::ImageMalformed,
+    Status::ImageUnsupported,
+    Status::ImageDamaged,
+    Status::ImageChanged,
+    Status::KernelMissing,
+    Status::InputCount,
+    Status::InputBytes,
+    Status::NoSuchPort,
+    Status::NotStarted,
+    Status::NotDone,
+    Status::NoWaypoints,
+    Status::TooShort,
+    Status::NoKnownAnswer,
+    Status::WrongAnswer,
+];
 
+impl Status {
     /// What it means, in a few words.
     pub const fn words(self) -> &'static CStr {
         match self {
@@ -151,9 +151,9 @@ mod tests {
 
     #[test]
     fn numbers_are_positions_and_no_words_are_said_twice() {
-        for (position, status) in Status::ALL.into_iter().enumerate() {
+        for (position, status) in ALL.into_iter().enumerate() {
             assert_eq!(status as usize, position);
-            assert!(Status::ALL.iter().take(position).all(|other| other.words() != status.words()), "{status:?}");
+            assert!(ALL.iter().take(position).all(|other| other.words() != status.words()), "{status:?}");
         }
     }
 }

@@ -100,7 +100,7 @@ pub enum Element {
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct PortInfo {
-    /// Name, UTF-8: `rgb`, `bev`, `velocity`, `goal`, `waypoints`, …
+    /// Name, UTF-8: `rgb`, `bev`, `velocity`, `goal`, `waypoints` and others.
     pub name: [c_char; PORT_NAME_BYTES],
     /// Type of the elements.
     pub element: Element,

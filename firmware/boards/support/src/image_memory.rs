@@ -1,7 +1,7 @@
 //! A model image in memory-mapped flash or RAM.
 
 use core::slice;
-use firmware::image::layout::header;
+use firmware::image::layout;
 
 /// The image that lies at `base`, as long as its header says, and no longer than `capacity`; the caller parses it.
 ///
@@ -10,7 +10,5 @@ use firmware::image::layout::header;
 pub unsafe fn stored(base: usize, capacity: usize) -> &'static [u8] {
     // SAFETY: the caller vouches for these bytes.
     let memory = unsafe { slice::from_raw_parts(base as *const u8, capacity) };
-    let stated = memory.get(header::TOTAL_BYTES).and_then(|field| field.try_into().ok()).map(u32::from_le_bytes);
-    let length = stated.and_then(|bytes| usize::try_from(bytes).ok()).unwrap_or(0);
-    memory.get(..length).unwrap_or(memory)
+    layout::stated_length(memory).and_then(|length| memory.get(..length)).unwrap_or(memory)
 }
