@@ -50,6 +50,9 @@ pub const ALL: [Board; 4] = [
     },
 ];
 
+/// The program in C (`firmware/boards/c`), which runs on the first board.
+pub const IN_C: Board = Board { name: "an386-c", ..ALL[0] };
+
 /// What a run gave.
 #[derive(Clone, Debug)]
 pub struct Run {
@@ -66,17 +69,7 @@ impl Board {
     /// # Panics
     /// The image cannot be written or the emulator not started.
     pub fn run(&self, image: &[u8]) -> Option<Run> {
-        let program = self.program();
-        if !program.exists() || !is_installed(self.emulator) {
-            let _ = writeln!(
-                std::io::stderr(),
-                "not run: board {}; tests/run builds {} and installs {} (Debian's package qemu-system-arm)",
-                self.name,
-                program.display(),
-                self.emulator
-            );
-            return None;
-        }
+        let program = self.built_program()?;
         let folder = tempfile::tempdir().expect("a temporary folder");
         let file = folder.path().join("model.img");
         fs::write(&file, image).expect("the image");
@@ -91,6 +84,22 @@ impl Board {
             .output()
             .unwrap_or_else(|e| panic!("{}: {e}", self.emulator));
         Some(Run { status: output.status.code(), console: String::from_utf8_lossy(&output.stdout).into_owned() })
+    }
+
+    /// The board's program; `None` where it or the emulator is missing, which is said past the test's capture.
+    pub fn built_program(&self) -> Option<PathBuf> {
+        let program = self.program();
+        if program.exists() && is_installed(self.emulator) {
+            return Some(program);
+        }
+        let _ = writeln!(
+            std::io::stderr(),
+            "not run: board {}; tests/run builds {} and installs {} (Debian's package qemu-system-arm)",
+            self.name,
+            program.display(),
+            self.emulator
+        );
+        None
     }
 
     fn program(&self) -> PathBuf {

@@ -18,7 +18,8 @@ impl Write for Buffer<'_> {
             if end >= self.bytes.len() {
                 return Err(fmt::Error);
             }
-            self.bytes.get_mut(self.length..end).ok_or(fmt::Error)?.copy_from_slice(encoded);
+            let room = self.bytes.get_mut(self.length..end).unwrap_or_default();
+            room.iter_mut().zip(encoded).for_each(|(place, byte)| *place = *byte);
             self.length = end;
         }
         Ok(())
