@@ -68,12 +68,14 @@ pub mod known_answer;
 pub mod layout;
 mod parse;
 mod records;
+mod stored;
 
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
 pub use checks::{Check, ParseError, Place};
 pub(crate) use checks::{ensure, ensure_equal, shown};
 pub use known_answer::KnownAnswer;
 pub use records::{Port, TensorRecord, text};
+pub use stored::StoredImage;
 
 /// A section of the file; the number is its slot in the header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

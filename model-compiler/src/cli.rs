@@ -1,4 +1,4 @@
-//! The command line: `quantize`, `compile`, `inspect`, `completions`.
+//! The command line: `quantize`, `compile`, `convert`, `inspect`, `completions`.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
@@ -20,12 +20,14 @@ use std::path::{Path, PathBuf};
 
 mod completions;
 mod console;
+mod convert;
 mod examples;
 mod inspect;
 mod progress;
 
 pub use completions::CompletionArgs;
 pub use console::Console;
+use convert::FormArgs;
 use progress::Bar;
 pub use progress::progress_bar;
 
@@ -59,8 +61,21 @@ enum Command {
         quantize: QuantizeArgs,
         #[command(flatten)]
         target: TargetArgs,
+        #[command(flatten)]
+        forms: FormArgs,
         /// Output file; the record gets the same name with the extension .record.
         #[arg(short, long, value_name = "OUT.img")]
+        output: PathBuf,
+    },
+    /// Model image in another form: Intel HEX, S-records, ELF object, Rust source.
+    #[command(after_help = examples::CONVERT)]
+    Convert {
+        /// Model image (.img).
+        image: PathBuf,
+        #[command(flatten)]
+        forms: FormArgs,
+        /// Output file.
+        #[arg(short, long, value_name = "OUT")]
         output: PathBuf,
     },
     /// What is in a file: image, quantized model, checkpoint or ONNX file.
@@ -315,9 +330,10 @@ impl Command {
     fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<String> {
         match self {
             Self::Quantize { model, quantize, output } => run_quantize(model, quantize, output, bar),
-            Self::Compile { model, quantize, target, output } => {
-                run_compile(model, quantize, target, output, bar, console)
+            Self::Compile { model, quantize, target, forms, output } => {
+                run_compile(model, quantize, target, (forms, output), bar, console)
             }
+            Self::Convert { image, forms, output } => convert::run(image, forms, output),
             Self::Inspect { file } => inspect::inspect(file),
             Self::Completions(shell) => Ok(shell.script::<Cli>()),
         }
@@ -340,17 +356,20 @@ fn run_compile(
     model: &Path,
     quantize: &QuantizeArgs,
     target: &TargetArgs,
-    output: &Path,
+    (forms, output): (&FormArgs, &Path),
     bar: &mut Bar,
     console: &mut Console<'_>,
 ) -> Result<String> {
-    check_output(output, model)?;
+    forms.check()?;
+    let image_path = forms.image_path(output)?;
     let record = pipeline::record_path(output);
     if record == output {
         let error = Error::new(ErrorCode::Usage, output.display().to_string(), "this name is for the record");
         return Err(error.with_help("give the image another extension, such as .img"));
     }
-    check_output(&record, model)?;
+    let beside = Some(image_path.clone()).filter(|path| path != output);
+    let outputs = [forms.paths(output), vec![record], beside.into_iter().collect()].concat();
+    convert::check_outputs(&outputs, model)?;
     let target_data = target.target()?;
     let quantized = if is_quantized(model)? {
         if quantize.calib.is_some() {
@@ -363,7 +382,10 @@ fn run_compile(
     let options = target.plan_options(&target_data);
     let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t));
     let compiled = compiled.map_err(|e| e.within(model.display()))?;
-    pipeline::write(&compiled, output)?;
+    let files = forms.files(&compiled.image, output)?;
+    let others = files.iter().map(|(path, bytes)| (path.as_path(), bytes.as_slice()));
+    let others: Vec<_> = others.filter(|(path, _)| *path != image_path).collect();
+    pipeline::write_with(&compiled, &image_path, &others)?;
     let mut text = String::new();
     for (key, value) in pipeline::summary(&compiled) {
         let _ = writeln!(text, "{key:>8}  {value}");

@@ -6,6 +6,7 @@ pub mod calibrate;
 pub mod cli;
 pub mod emit;
 pub mod error;
+pub mod flash;
 pub mod frames;
 pub mod import;
 pub mod integer_reference;
