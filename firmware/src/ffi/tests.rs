@@ -1,4 +1,4 @@
-#![allow(clippy::indexing_slicing, reason = "an index out of range is a failed test")]
+#![allow(clippy::indexing_slicing, clippy::unwrap_used, reason = "a failed test")]
 
 extern crate std;
 

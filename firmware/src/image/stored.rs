@@ -21,6 +21,7 @@ impl<const BYTES: usize> StoredImage<BYTES> {
     ///
     /// static CUT: StoredImage<16> = StoredImage::new(b"\x93DRIVE\r\n\x01\0\x01\0\x30\x02\0\0");
     /// ```
+    #[allow(clippy::panic, reason = "in a static it is an error of the compiler")]
     pub const fn new(bytes: &[u8; BYTES]) -> Self {
         match layout::stated_length(bytes) {
             None => panic!("the file is no model image"),
