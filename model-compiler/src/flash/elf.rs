@@ -43,7 +43,7 @@ pub(super) fn object(image: &[u8], machine: Machine) -> Result<Vec<u8>> {
     let symbols = [
         ("model_start", 0, bytes, data),
         ("model_end", bytes, 0, data),
-        ("model_size", bytes, 0, (SymbolSection::Absolute, SymbolKind::Unknown)),
+        ("model_size", bytes, 0, (SymbolSection::Absolute, SymbolKind::Data)),
     ];
     for (name, value, size, (section, kind)) in symbols {
         object.add_symbol(Symbol {
