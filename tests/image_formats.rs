@@ -184,3 +184,100 @@ fn compile_writes_form_image_record_and_script_together() {
     folder.ok("model-compiler convert @net.img --format srec --address 553648128 --linker @two.x -o @two.srec");
     assert!(folder.read("two.srec") == folder.read("new.srec") && folder.read("two.x") == folder.read("new.x"));
 }
+
+/// The command fails with this text, and no file appears.
+#[track_caller]
+fn refused(folder: &Folder, command: &str, expected: &str) {
+    let names = folder.names();
+    let outcome = folder.run(&format!("model-compiler {command}"));
+    let expected = format!("error: {expected}\n");
+    assert_eq!((outcome.status, outcome.out.as_str(), outcome.err.as_str()), (2, "", expected.as_str()), "{command}");
+    assert_eq!(folder.names(), names, "{command}: files");
+}
+
+#[test]
+fn options_that_cannot_be_met_are_refused() {
+    let folder = compiled();
+    let bytes = folder.read("net.img").len() as u64;
+    let add = "add --address 0x… (where the image lies in the chip's memory, a multiple of 16)";
+    let cases = [
+        (
+            "convert @net.img --format hex -o @new.hex",
+            format!("--address: hex needs the address of the image\n  help: {add}"),
+        ),
+        (
+            "convert @net.img --format srec --address 0xFFFFFFF0 -o @new.srec",
+            format!(
+                "--address: the image's {bytes} B at 0xfffffff0 end at {:#x}, behind 32-bit addresses\n  help: choose a \
+                 lower address, or --format elf",
+                0xFFFF_FFF0 + bytes
+            ),
+        ),
+        (
+            "convert @net.img --format hex --machine arm --address 0 -o @new.hex",
+            "--machine: there is no architecture in a file of --format hex\n  help: leave it out, or add --format elf"
+                .into(),
+        ),
+        (
+            "convert @net.img --format rs --address 0 --linker @new.x -o @new.rs",
+            "--linker: the image lies among the program's constants in a file of --format rs\n  help: leave it out, or \
+             add --format elf"
+                .into(),
+        ),
+        (
+            "convert @net.img --format elf --address 0 -o @new.o",
+            "--address: there is no address in a file of --format elf\n  help: leave it out, or add --linker FILE.x"
+                .into(),
+        ),
+        (
+            "convert @net.img -o @net.img",
+            "@net.img: the output would replace the input\n  help: give it another name".into(),
+        ),
+        (
+            "convert @net.img --format elf --address 0 --linker @new.o -o @new.o",
+            "@new.o: two outputs have this name\n  help: give each another name".into(),
+        ),
+        (
+            "compile @net.safetensors --calib @inputs.safetensors --format elf -o @new.img",
+            "@new.img: this name is for the image itself\n  help: give the output another extension, such as .elf"
+                .into(),
+        ),
+        (
+            "convert @net.safetensors --format elf -o @new.o",
+            "@net.safetensors: header byte 0: this is not a model image: found".into(),
+        ),
+    ];
+    for (command, message) in cases {
+        if message.ends_with("found") {
+            let outcome = folder.run(&format!("model-compiler {command}"));
+            assert!(outcome.status == 2 && outcome.err.contains(&message), "{}", outcome.err);
+        } else {
+            refused(&folder, command, &message);
+        }
+    }
+}
+
+#[test]
+fn addresses_that_are_none_are_usage_errors() {
+    let folder = compiled();
+    for (address, message) in [
+        ("0x8", "found 0x8, expected a multiple of 16"),
+        ("flash", "found \"flash\", expected an address such as 0x21000000"),
+    ] {
+        let outcome =
+            folder.run(&format!("model-compiler convert @net.img --format hex --address {address} -o @new.hex"));
+        assert!(outcome.status == 2 && outcome.err.contains(message), "{}", outcome.err);
+    }
+}
+
+#[test]
+fn inspect_says_what_a_form_is() {
+    let folder = compiled();
+    for (format, form) in [("hex", "Intel HEX"), ("srec", "a file of S-records"), ("elf", "an ELF file")] {
+        let address = if format == "elf" { "" } else { " --address 0x21000000" };
+        folder.ok(&format!("model-compiler convert @net.img --format {format}{address} -o @new.{format}"));
+        let message =
+            format!("@new.{format}: this is {form}, a form of an image\n  help: inspect the .img that it was made of");
+        refused(&folder, &format!("inspect @new.{format}"), &message);
+    }
+}

@@ -21,6 +21,7 @@ use std::path::{Path, PathBuf};
 mod completions;
 mod console;
 mod convert;
+mod diff;
 mod examples;
 mod inspect;
 mod progress;
@@ -83,6 +84,12 @@ enum Command {
     Inspect {
         /// The file.
         file: PathBuf,
+        /// Earlier image: say what changed from it to the file. Exit status 1 where they are not equal.
+        #[arg(long, value_name = "BEFORE.img")]
+        diff: Option<PathBuf>,
+        /// The changes as JSON.
+        #[arg(long, requires = "diff")]
+        json: bool,
     },
     /// Script that completes commands and options in a shell.
     #[command(after_help = examples::COMPLETIONS)]
@@ -314,9 +321,9 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
     let result = cli.command.execute(&mut bar, &mut console);
     bar.finish();
     match result {
-        Ok(text) => {
+        Ok((text, status)) => {
             console.print(&text);
-            0
+            status
         }
         Err(error) => {
             console.complain(&format!("error: {error}"));
@@ -326,17 +333,20 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
 }
 
 impl Command {
-    /// Runs the command; what it has to say is for standard output. Nothing half-written is left behind.
-    fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<String> {
-        match self {
+    /// Runs the command; what it has to say is for standard output, its number the exit status. Nothing half-written is
+    /// left behind.
+    fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<(String, u8)> {
+        let done = match self {
+            Self::Inspect { file, diff: Some(before), json } => return diff::run(before, file, *json),
             Self::Quantize { model, quantize, output } => run_quantize(model, quantize, output, bar),
             Self::Compile { model, quantize, target, forms, output } => {
                 run_compile(model, quantize, target, (forms, output), bar, console)
             }
             Self::Convert { image, forms, output } => convert::run(image, forms, output),
-            Self::Inspect { file } => inspect::inspect(file),
+            Self::Inspect { file, .. } => inspect::inspect(file),
             Self::Completions(shell) => Ok(shell.script::<Cli>()),
-        }
+        };
+        done.map(|text| (text, 0))
     }
 }
 

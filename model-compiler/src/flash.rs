@@ -103,6 +103,12 @@ pub fn linker_script(image: &[u8], name: &str, options: &Options) -> Result<Vec<
         .into_bytes())
 }
 
+/// The form that a file seems to have, by its first bytes; `None` for everything else, the image itself included.
+pub fn form(bytes: &[u8]) -> Option<&'static str> {
+    let forms: [(&[u8], _); 3] = [(b"\x7fELF", "an ELF file"), (b":", "Intel HEX"), (b"S0", "a file of S-records")];
+    forms.into_iter().find(|(start, _)| bytes.starts_with(start)).map(|(_, form)| form)
+}
+
 fn address(options: &Options, what: &str) -> Result<Address> {
     options.address.ok_or_else(|| needs_address(what))
 }

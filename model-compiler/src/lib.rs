@@ -8,6 +8,7 @@ pub mod emit;
 pub mod error;
 pub mod flash;
 pub mod frames;
+pub mod image_diff;
 pub mod import;
 pub mod integer_reference;
 pub mod ir;

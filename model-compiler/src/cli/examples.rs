@@ -31,7 +31,8 @@ pub const INSPECT: &str = "Examples:
   model-compiler inspect transfuser.img
   model-compiler inspect transfuser.qmodel
   model-compiler inspect transfuser.pth
-  model-compiler inspect resnet20.onnx";
+  model-compiler inspect resnet20.onnx
+  model-compiler inspect --diff before.img after.img";
 
 pub const COMPLETIONS: &str = "In bash: `source <(model-compiler completions bash)`, now or in ~/.bashrc.
 
