@@ -68,6 +68,7 @@ pub mod known_answer;
 pub mod layout;
 mod parse;
 mod records;
+mod stored;
 
 pub(crate) use checker::Cursor;
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
@@ -76,6 +77,7 @@ pub use checks::{Check, ParseError, Place};
 pub(crate) use checks::{ensure, ensure_equal, shown};
 pub use known_answer::KnownAnswer;
 pub use records::{Port, TensorRecord, text};
+pub use stored::StoredImage;
 
 /// A section of the file; the number is its slot in the header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

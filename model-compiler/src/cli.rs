@@ -1,4 +1,4 @@
-//! The command line: `quantize`, `compile`, `inspect`, `completions`.
+//! The command line: `quantize`, `compile`, `convert`, `inspect`, `completions`.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
@@ -20,12 +20,15 @@ use std::path::{Path, PathBuf};
 
 mod completions;
 mod console;
+mod convert;
+mod diff;
 mod examples;
 mod inspect;
 mod progress;
 
 pub use completions::CompletionArgs;
 pub use console::Console;
+use convert::FormArgs;
 use progress::Bar;
 pub use progress::progress_bar;
 
@@ -62,8 +65,21 @@ enum Command {
         /// Revision of the model: an update in the field refuses a lower one than it runs.
         #[arg(long, default_value_t = 0, value_name = "N")]
         revision: u32,
+        #[command(flatten)]
+        forms: FormArgs,
         /// Output file; the record gets the same name with the extension .record.
         #[arg(short, long, value_name = "OUT.img")]
+        output: PathBuf,
+    },
+    /// Model image in another form: Intel HEX, S-records, ELF object, Rust source.
+    #[command(after_help = examples::CONVERT)]
+    Convert {
+        /// Model image (.img).
+        image: PathBuf,
+        #[command(flatten)]
+        forms: FormArgs,
+        /// Output file.
+        #[arg(short, long, value_name = "OUT")]
         output: PathBuf,
     },
     /// What is in a file: image, quantized model, checkpoint or ONNX file.
@@ -71,6 +87,12 @@ enum Command {
     Inspect {
         /// The file.
         file: PathBuf,
+        /// Earlier image: say what changed from it to the file. Exit status 1 where they are not equal.
+        #[arg(long, value_name = "BEFORE.img")]
+        diff: Option<PathBuf>,
+        /// The changes as JSON.
+        #[arg(long, requires = "diff")]
+        json: bool,
     },
     /// Script that completes commands and options in a shell.
     #[command(after_help = examples::COMPLETIONS)]
@@ -302,9 +324,9 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
     let result = cli.command.execute(&mut bar, &mut console);
     bar.finish();
     match result {
-        Ok(text) => {
+        Ok((text, status)) => {
             console.print(&text);
-            0
+            status
         }
         Err(error) => {
             console.complain(&format!("error: {error}"));
@@ -314,16 +336,20 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
 }
 
 impl Command {
-    /// Runs the command; what it has to say is for standard output. Nothing half-written is left behind.
-    fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<String> {
-        match self {
+    /// Runs the command; what it has to say is for standard output, its number the exit status. Nothing half-written is
+    /// left behind.
+    fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<(String, u8)> {
+        let done = match self {
+            Self::Inspect { file, diff: Some(before), json } => return diff::run(before, file, *json),
             Self::Quantize { model, quantize, output } => run_quantize(model, quantize, output, bar),
-            Self::Compile { model, quantize, target, revision, output } => {
-                run_compile(model, quantize, target, *revision, output, bar, console)
+            Self::Compile { model, quantize, target, revision, forms, output } => {
+                run_compile(model, quantize, target, *revision, (forms, output), bar, console)
             }
-            Self::Inspect { file } => inspect::inspect(file),
+            Self::Convert { image, forms, output } => convert::run(image, forms, output),
+            Self::Inspect { file, .. } => inspect::inspect(file),
             Self::Completions(shell) => Ok(shell.script::<Cli>()),
-        }
+        };
+        done.map(|text| (text, 0))
     }
 }
 
@@ -344,17 +370,20 @@ fn run_compile(
     quantize: &QuantizeArgs,
     target: &TargetArgs,
     revision: u32,
-    output: &Path,
+    (forms, output): (&FormArgs, &Path),
     bar: &mut Bar,
     console: &mut Console<'_>,
 ) -> Result<String> {
-    check_output(output, model)?;
+    forms.check()?;
+    let image_path = forms.image_path(output)?;
     let record = pipeline::record_path(output);
     if record == output {
         let error = Error::new(ErrorCode::Usage, output.display().to_string(), "this name is for the record");
         return Err(error.with_help("give the image another extension, such as .img"));
     }
-    check_output(&record, model)?;
+    let beside = Some(image_path.clone()).filter(|path| path != output);
+    let outputs = [forms.paths(output), vec![record], beside.into_iter().collect()].concat();
+    convert::check_outputs(&outputs, model)?;
     let target_data = target.target()?;
     let quantized = if is_quantized(model)? {
         if quantize.calib.is_some() {
@@ -367,7 +396,10 @@ fn run_compile(
     let options = target.plan_options(&target_data);
     let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t));
     let compiled = compiled.and_then(|c| c.with_revision(revision)).map_err(|e| e.within(model.display()))?;
-    pipeline::write(&compiled, output)?;
+    let files = forms.files(&compiled.image, output)?;
+    let others = files.iter().map(|(path, bytes)| (path.as_path(), bytes.as_slice()));
+    let others: Vec<_> = others.filter(|(path, _)| *path != image_path).collect();
+    pipeline::write_with(&compiled, &image_path, &others)?;
     let mut text = String::new();
     for (key, value) in pipeline::summary(&compiled) {
         let _ = writeln!(text, "{key:>8}  {value}");

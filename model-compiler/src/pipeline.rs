@@ -126,8 +126,19 @@ pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress:
 /// # Errors
 /// A file cannot be written; then neither is left half-written, nor one without the other.
 pub fn write(compiled: &Compiled, image_path: &Path) -> Result<()> {
-    let record = artifact::to_bytes(&compiled.record)?;
-    artifact::write_files(&[(&record_path(image_path), &record), (image_path, &compiled.image)])
+    write_with(compiled, image_path, &[])
+}
+
+/// Writes `OUT.img`, `OUT.record` and other files that belong to them.
+///
+/// # Errors
+/// A file cannot be written; then none is left half-written, nor one without the others.
+pub fn write_with(compiled: &Compiled, image_path: &Path, others: &[(&Path, &[u8])]) -> Result<()> {
+    let (record, record_path) = (artifact::to_bytes(&compiled.record)?, record_path(image_path));
+    let mut files = vec![(record_path.as_path(), record.as_slice())];
+    files.extend_from_slice(others);
+    files.push((image_path, &compiled.image));
+    artifact::write_files(&files)
 }
 
 /// The record that belongs to an image: the same name with the extension `record`.

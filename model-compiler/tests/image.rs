@@ -542,6 +542,7 @@ fn format_page_shows_a_real_image() {
     let dump: String = lines.collect();
     let page = include_str!("../../firmware/src/image/example.hex");
     assert_eq!(dump, page, "the dump of firmware/src/image/example.hex should be:\n{dump}");
+    assert_eq!(bytes, include_bytes!("../../firmware/src/image/example.bin"));
 }
 
 #[test]

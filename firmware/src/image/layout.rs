@@ -1,6 +1,7 @@
 //! Named byte ranges of the image file: the one place that knows where a field lies. The reader ([`super::Image`]) and
 //! the compiler's writer both use these constants.
 
+use crate::tensor::index;
 use core::ops::Range;
 
 /// First eight bytes of every image. The first byte is not ASCII and the tail catches line-end conversion.
@@ -177,6 +178,17 @@ pub mod known_answer {
     pub const CRCS: usize = 8;
     /// Size of one CRC.
     pub const CRC_BYTES: usize = 4;
+}
+
+/// Length of the image that begins with these bytes, as its header states it; `None` where no image begins.
+pub const fn stated_length(bytes: &[u8]) -> Option<usize> {
+    let Some((_, rest)) = bytes.split_at_checked(header::TOTAL_BYTES.start) else { return None };
+    match (bytes.first_chunk(), rest.first_chunk()) {
+        (Some(magic), Some(total)) if u64::from_le_bytes(*magic) == u64::from_le_bytes(MAGIC) => {
+            Some(index(u32::from_le_bytes(*total)))
+        }
+        _ => None,
+    }
 }
 
 /// `length` rounded up to a multiple of [`ALIGNMENT`].

@@ -2,7 +2,8 @@
 
 use crate::artifact::{self, hex};
 use crate::emit::AlignedBytes;
-use crate::error::{Error, Result};
+use crate::error::{Error, ErrorCode, Result};
+use crate::flash;
 use crate::import::{NamedTensors, System, checkpoint, onnx};
 use crate::qmodel::QModel;
 use crate::record::Record;
@@ -27,6 +28,9 @@ pub fn inspect(path: &Path) -> Result<String> {
     } else if onnx::is_onnx(&bytes) {
         let digest = hex(&artifact::sha256(&bytes));
         onnx::Model::parse(bytes).map(|model| network(&model, &digest))
+    } else if let Some(form) = flash::form(&bytes) {
+        let error = Error::new(ErrorCode::Unsupported, "", format!("this is {form}, a form of an image"));
+        Err(error.with_help("inspect the .img that it was made of"))
     } else {
         checkpoint::parse(&bytes).map(|checkpoint| tensors(&checkpoint))
     };
@@ -34,7 +38,7 @@ pub fn inspect(path: &Path) -> Result<String> {
 }
 
 /// A plain table: headers, then rows; every column after the first `left` ones is aligned right.
-fn table(headers: &[&str], left: usize) -> Table {
+pub(super) fn table(headers: &[&str], left: usize) -> Table {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_header(headers);
     for (index, column) in table.column_iter_mut().enumerate() {
