@@ -196,7 +196,7 @@ impl Edit {
 }
 
 /// Checks that no image needs alone, with the reason.
-const SECOND_OPINIONS: [(Check, &str); 4] = [
+const SECOND_OPINIONS: [(Check, &str); 5] = [
     (
         Check::HeaderLength,
         "what a shorter file lacks reads as zero, which the next checks refuse; the message is better",
@@ -205,6 +205,7 @@ const SECOND_OPINIONS: [(Check, &str); 4] = [
         Check::Features,
         "an unknown bit also differs from what the program uses; named first, it says that a runtime is old",
     ),
+    (Check::TensorRegion, "a region that is not listed has no bytes, so the tensor also ends outside"),
     (Check::TensorLive, "a false range is also one whose first step does not write or whose last step does not read"),
     (Check::StepReadsScratch, "scratch is live in its own step only, so reading it also reads what holds nothing"),
 ];
