@@ -5,10 +5,14 @@
 //! all its steps. What fits nowhere is moved to the front, where it goes to the last region that has room, and the rest
 //! is taken again around it. "Hottest" is tried by several keys (traffic per byte and step, per byte, in all), each with
 //! three choices of in-place pairs: a chain of them is one item and stays together, so fewer pairs leave more freedom
-//! and need more memory. Pairs that ended in one region are joined again at the end.
+//! and need more memory. At the end, pairs that came to lie in one region are joined again, and what then has room in a
+//! faster region moves there.
 //!
 //! Room is counted in live bytes. Each region is then packed like a single arena; where the packing is larger than the
 //! region, that region is filled less by the difference and all is taken again.
+
+#[cfg(test)]
+mod tests;
 
 use super::{Items, Job, Layout, Pairs, items, solver};
 use std::cmp::Ordering;
@@ -66,6 +70,28 @@ impl Choice {
     fn is_better_than(&self, other: &Self) -> bool {
         (other.overflow, &self.traffic) > (self.overflow, &other.traffic)
     }
+
+    /// Moves items to faster regions that have room for them, hottest first.
+    fn raise(&mut self, job: &Job<'_>, budgets: &[u64]) {
+        let mut memory = self.memory(job, budgets);
+        for candidate in candidates(job, &self.items, KEYS[0]) {
+            let shape = &self.items.shapes[candidate.item];
+            let region = &mut self.region_of[candidate.item];
+            memory.release(*region, shape);
+            let faster = (0..*region).find(|&faster| memory.has_room(faster, shape)).unwrap_or(*region);
+            self.traffic[*region] -= candidate.traffic;
+            self.traffic[faster] += candidate.traffic;
+            *region = faster;
+            memory.take(faster, shape);
+        }
+    }
+
+    /// What the items take.
+    fn memory<'b>(&self, job: &Job<'_>, budgets: &'b [u64]) -> Memory<'b> {
+        let mut memory = Memory::new(budgets, job.order.len());
+        self.items.shapes.iter().zip(&self.region_of).for_each(|(shape, &region)| memory.take(region, shape));
+        memory
+    }
 }
 
 /// The best assignment over all choices of pairs and keys.
@@ -77,7 +103,8 @@ fn choose(job: &Job<'_>, all: &Pairs, budgets: &[u64]) -> Choice {
     let mut best: Option<Choice> = None;
     for pairs in choices {
         for key in KEYS {
-            let choice = joined(job, all, assign(job, pairs.clone(), key, budgets), budgets);
+            let mut choice = joined(job, all, assign(job, pairs.clone(), key, budgets), budgets);
+            choice.raise(job, budgets);
             if best.as_ref().is_none_or(|best| choice.is_better_than(best)) {
                 best = Some(choice);
             }
@@ -106,9 +133,8 @@ fn hotter(a: [u64; 2], b: [u64; 2]) -> Ordering {
     cross(b[0], a[1]).cmp(&cross(a[0], b[1]))
 }
 
-/// Assigns every item, hottest first.
-fn assign(job: &Job<'_>, pairs: Pairs, key: Key, budgets: &[u64]) -> Choice {
-    let items = items(job, &pairs);
+/// All items, hottest first.
+fn candidates(job: &Job<'_>, items: &Items, key: Key) -> Vec<Candidate> {
     let traffic = items.traffic(job.needs, job.order);
     let candidate = |(item, shape): (usize, &solver::Item)| Candidate {
         item,
@@ -118,7 +144,13 @@ fn assign(job: &Job<'_>, pairs: Pairs, key: Key, budgets: &[u64]) -> Choice {
     };
     let mut candidates: Vec<Candidate> = items.shapes.iter().enumerate().map(candidate).collect();
     candidates.sort_by(|a, b| hotter(key(a), key(b)).then(a.item.cmp(&b.item)));
-    let mut order: Vec<usize> = candidates.iter().map(|c| c.item).collect();
+    candidates
+}
+
+/// Assigns every item, hottest first.
+fn assign(job: &Job<'_>, pairs: Pairs, key: Key, budgets: &[u64]) -> Choice {
+    let items = items(job, &pairs);
+    let mut order: Vec<usize> = candidates(job, &items, key).iter().map(|c| c.item).collect();
     let mut moved = vec![false; order.len()];
     let mut best: Option<(u64, Vec<usize>)> = None;
     for _ in 0..ROUNDS {
@@ -147,7 +179,8 @@ fn assign(job: &Job<'_>, pairs: Pairs, key: Key, budgets: &[u64]) -> Choice {
     }
     let (overflow, region_of) = best.unwrap_or_default();
     let mut by_region = vec![0; budgets.len()];
-    region_of.iter().zip(&traffic).for_each(|(&region, bytes)| by_region[region] += bytes);
+    let traffic = items.traffic(job.needs, job.order);
+    region_of.iter().zip(traffic).for_each(|(&region, bytes)| by_region[region] += bytes);
     Choice { pairs, items, region_of, overflow, traffic: by_region }
 }
 
@@ -162,9 +195,9 @@ fn joined(job: &Job<'_>, all: &Pairs, choice: Choice, budgets: &[u64]) -> Choice
     for (item, old) in items.of_scratch.iter().zip(&choice.items.of_scratch) {
         item.iter().zip(old).for_each(|(&item, &old)| region_of[item] = choice.region_of[old]);
     }
-    let mut memory = Memory::new(budgets, job.order.len());
-    items.shapes.iter().zip(&region_of).for_each(|(shape, &region)| memory.take(region, shape));
-    Choice { pairs, items, region_of, overflow: memory.overflow(), traffic: choice.traffic }
+    let mut joined = Choice { pairs, items, region_of, overflow: 0, traffic: choice.traffic };
+    joined.overflow = joined.memory(job, budgets).overflow();
+    joined
 }
 
 /// Packs every region.
@@ -212,6 +245,13 @@ impl<'a> Memory<'a> {
         for span in &item.spans {
             let live = &mut self.live[region][span.first as usize..=span.last as usize];
             live.iter_mut().for_each(|bytes| *bytes += span.bytes);
+        }
+    }
+
+    fn release(&mut self, region: usize, item: &solver::Item) {
+        for span in &item.spans {
+            let live = &mut self.live[region][span.first as usize..=span.last as usize];
+            live.iter_mut().for_each(|bytes| *bytes -= span.bytes);
         }
     }
 

@@ -126,3 +126,108 @@ impl Counter<'_> {
         self.model.tensor(tensor).element.bytes().into()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::qmodel::{Bounds, Port, QRescale, QResidual, QStep, QTensor};
+    use firmware::program::{Clamp, Requant};
+    use firmware::tensor::Shape;
+
+    const CLAMP: Clamp = Clamp { min: -128, max: 127 };
+    const REQUANT: Requant = Requant { multiplier: 1 << 23, shift: 23 };
+
+    /// A model of one step over tensors of these shapes, the last of which it writes.
+    fn traffic_of(tensors: &[(Shape, ElementType)], op: QOp, kernel: Option<KernelId>) -> (Vec<u64>, u64) {
+        let tensor = |&(shape, element): &(Shape, ElementType)| QTensor {
+            name: String::new(),
+            value: String::new(),
+            shape,
+            element,
+            scale: 1.0,
+            zero_point: 0,
+            saturation_ppm: None,
+        };
+        let port = |id| Port { name: String::new(), tensor: QTensorId(id), kind: None };
+        let last = tensors.len() as u32 - 1;
+        let model = QModel {
+            name: String::new(),
+            system: String::new(),
+            tensors: tensors.iter().map(tensor).collect(),
+            steps: vec![QStep { name: String::new(), node: None, op, bounds: Bounds::default() }],
+            inputs: (0..last).map(port).collect(),
+            outputs: vec![port(last)],
+            provenance: vec![],
+        };
+        let (tensors, scratch) = traffic(&model, &[kernel]);
+        (tensors, scratch[0])
+    }
+
+    fn rescale(residual: QResidual) -> QRescale {
+        let (bias, multipliers, shifts) = (vec![], vec![], vec![]);
+        QRescale { pre_shift: 0, bias, multipliers, shifts, zero_point: 0, clamp: CLAMP, residual }
+    }
+
+    #[test]
+    fn a_convolution_reads_its_windows_and_scratch_per_product() {
+        let (input, output) = (Shape::map(4, 4, 2), Shape::map(4, 4, 8));
+        let residual = QResidual::Scaled { tensor: QTensorId(1), zero_point: 0, multipliers: vec![] };
+        let op = QOp::Conv2d {
+            input: QTensorId(0),
+            output: QTensorId(2),
+            window: Window::square(3, 1, 1),
+            groups: 1,
+            weights: vec![],
+            padding_codes: vec![],
+            rescale: rescale(residual),
+        };
+        let tensors = [(input, ElementType::I8), (output, ElementType::I8), (output, ElementType::I8)];
+        let gathered = 16 * 9 * 2;
+        // Each port is touched once by the caller; the residual is read and the output written once.
+        let expected = vec![32 + gathered, 128 + 128, 128 + 128];
+        assert_eq!(traffic_of(&tensors, op, Some(KernelId::Direct)), (expected, 2 * (gathered + gathered * 8)));
+    }
+
+    #[test]
+    fn a_linear_layer_reads_wide_inputs_where_they_lie_unless_they_are_gathered() {
+        let op = || QOp::Linear {
+            input: QTensorId(0),
+            output: QTensorId(1),
+            weights: vec![],
+            wide: false,
+            rescale: rescale(QResidual::None),
+        };
+        let (input, output) = (Shape::tokens(3, 10), Shape::tokens(3, 4));
+        let of = |element, kernel| traffic_of(&[(input, element), (output, ElementType::I8)], op(), Some(kernel));
+        assert_eq!(of(ElementType::I8, KernelId::Direct), (vec![30 + 30, 12 + 12], 2 * (30 + 120)));
+        assert_eq!(of(ElementType::I16, KernelId::Direct), (vec![60 + 240, 24], 0));
+        assert_eq!(of(ElementType::I16, KernelId::K4N16), (vec![60 + 60, 24], 2 * (30 + 120)));
+    }
+
+    #[test]
+    fn attention_reads_keys_and_values_once_per_query() {
+        let op = QOp::Attention {
+            query: QTensorId(0),
+            key: QTensorId(1),
+            value: QTensorId(2),
+            output: QTensorId(3),
+            heads: 2,
+            exponent: REQUANT,
+            exp_table: vec![],
+            requant: REQUANT,
+            zero_point: 0,
+            clamp: CLAMP,
+        };
+        let (tensors, scratch) = traffic_of(&[(Shape::tokens(5, 8), ElementType::I8); 4], op, None);
+        assert_eq!(tensors, [40 + 40, 40 + 200, 40 + 200, 40 + 40]);
+        assert_eq!(scratch, 5 * 4 * 2 * 25 + 2 * (40 + 200) + 8 * 200);
+    }
+
+    #[test]
+    fn an_operand_that_is_read_twice_counts_twice() {
+        let term = crate::qmodel::QTerm { tensor: QTensorId(0), zero_point: 0, multiplier: 1 };
+        let output = QTensorId(1);
+        let op = QOp::Add { first: term, second: term, output, shift: 0, zero_point: 0, clamp: CLAMP };
+        assert_eq!(traffic_of(&[(Shape::vector(6), ElementType::I8); 2], op, None), (vec![18, 12], 0));
+    }
+}

@@ -32,13 +32,13 @@ fn panic(_: &PanicInfo<'_>) -> ! {
 /// What a boot loader would call. Nothing is known of the image, the arena and the inputs.
 #[unsafe(no_mangle)]
 pub extern "C" fn start() -> bool {
-    let mut arena = [0; 64];
-    infer(black_box(&[]), black_box(&mut arena), black_box(&[])).is_some()
+    let [mut fast, mut main] = [[0; 64]; 2];
+    infer(black_box(&[]), [black_box(&mut fast), black_box(&mut main)], black_box(&[])).is_some()
         & sense(black_box(&Raw::default())).is_some()
         & drive(black_box(&Trip::default()))
 }
 
-fn infer(image: &[u8], arena: &mut [u8], inputs: &[&[u8]]) -> Option<()> {
+fn infer(image: &[u8], arena: [&mut [u8]; 2], inputs: &[&[u8]]) -> Option<()> {
     let image = Image::parse(image).ok()?;
     image.check().ok()?;
     let mut engine = Engine::new(image, Portable, arena).ok()?;
