@@ -1,7 +1,7 @@
 //! Runtime for quantized driving networks: `no_std`, no heap, no float in inference, no panic after validation.
 //!
 //! A network arrives as a *model image*, written by the compiler and executed in place. The runtime proves once that
-//! the image cannot lead it astray, and then runs it step by step in a buffer that the caller owns:
+//! the image cannot lead it astray, and then runs it step by step in memory that the caller owns:
 //!
 //! ```
 //! use firmware::engine::{Engine, EngineError, Progress};
@@ -29,7 +29,7 @@
 //! * [`drive`]: around the network: route, goal, waypoints to steer, throttle and brake, supervision. Fixed point.
 //! * [`engine`]: `start`, `step`, `infer`, self-test. Owns nothing but a position.
 //! * [`ops`]: one operator per file: what its step must satisfy, and how it becomes a call of a kernel.
-//! * [`arena`]: the operands of a step as disjoint slices of one buffer, by checked means only.
+//! * [`arena`]: the operands of a step as disjoint slices of the memory regions, by checked means only.
 //! * [`kernels`]: one method per operator; [`kernels::portable`] is the norm, other backends equal it byte for byte.
 //!   [`kernels::plan`] tells compiler and runtime what a kernel needs. Under the feature `conformance` a sweep proves it.
 //! * [`image`] and [`program`]: the file format, its checks, and the steps. The compiler writes what these define.

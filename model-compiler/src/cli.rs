@@ -12,7 +12,7 @@ use crate::passes::PassOptions;
 use crate::pipeline;
 use crate::qmodel::QModel;
 use crate::quantize::{QuantizeOptions, RangeRule, SkipStages};
-use crate::target::{Target, parse_size};
+use crate::target::{Region, Target, parse_size};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -220,14 +220,24 @@ fn size(text: &str) -> std::result::Result<u64, String> {
     parse_size(text).map_err(|e| format!("{}, {}", e.message, e.help))
 }
 
+/// `NAME=BYTES`; names are judged where the regions meet.
+fn region(text: &str) -> std::result::Result<Region, String> {
+    let (name, bytes) = text.split_once('=').ok_or_else(|| format!("found {text:?}, expected NAME=BYTES"))?;
+    Ok(Region { name: name.into(), bytes: Some(size(bytes)?) })
+}
+
 #[derive(Debug, Args)]
 struct TargetArgs {
     /// Built-in target name, or a .toml file that describes one.
     #[arg(long, default_value = "portable", value_name = "NAME|FILE.toml")]
     target: String,
     /// RAM for the arena: bytes, or with K or M.
-    #[arg(long, value_name = "BYTES", value_parser = size)]
+    #[arg(long, value_name = "BYTES", value_parser = size, conflicts_with = "region")]
     ram: Option<u64>,
+    /// A memory for the arena, instead of the target's: name and bytes (or with K or M). Give up to four, the fastest
+    /// first: the hottest buffers go there.
+    #[arg(long, value_name = "NAME=BYTES", value_parser = region)]
+    region: Vec<Region>,
     /// Flash for the image: bytes, or with K or M.
     #[arg(long, value_name = "BYTES", value_parser = size)]
     flash: Option<u64>,
@@ -299,7 +309,16 @@ impl QuantizeArgs {
 
 impl TargetArgs {
     fn target(&self) -> Result<Target> {
-        Ok(Target::find(&self.target)?.with_limits(self.ram, self.flash))
+        let mut target = Target::find(&self.target)?;
+        if !self.region.is_empty() {
+            target = target.with_regions(self.region.clone())?;
+        }
+        if self.ram.is_some() && target.regions.len() > 1 {
+            let names: Vec<String> = target.regions.iter().map(|r| format!("--region {}=BYTES", r.name)).collect();
+            let message = format!("target {} has {} memories, --ram is the size of one", target.name, names.len());
+            return Err(Error::new(ErrorCode::Usage, "--ram", message).with_help(format!("use {}", names.join(" "))));
+        }
+        Ok(target.with_limits(self.ram, self.flash))
     }
 
     fn plan_options(&self, target: &Target) -> PlanOptions {

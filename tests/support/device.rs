@@ -2,7 +2,7 @@
 
 use crate::nor_flash::NorFlash;
 use crate::random::Random;
-use firmware::image::{CheckProgress, Image, TensorRecord, crc32, layout};
+use firmware::image::{CheckProgress, Image, Region, RegionName, TensorRecord, crc32, layout};
 use firmware::kernels::{Kernels, Portable};
 use firmware::program::{Clamp, Requant, Requantize, Step};
 use firmware::tensor::{ElementType, Shape, TensorId};
@@ -22,6 +22,7 @@ pub fn parts(revision: u32, bytes: usize) -> ImageParts {
     let tensor = |offset| TensorRecord {
         element: ElementType::I8,
         shape: Shape::vector(16),
+        region: 0,
         offset,
         bytes: 16,
         first_step: 0,
@@ -44,8 +45,7 @@ pub fn parts(revision: u32, bytes: usize) -> ImageParts {
         constants: (0..bytes).map(|_| random.bits() as u8).collect(),
         inputs: vec![port("x", 0)],
         outputs: vec![port("y", 1)],
-        arena_bytes: 32,
-        arena_alignment: 16,
+        regions: vec![Region { name: RegionName::MAIN, bytes: 32, alignment: 16 }],
         target: TARGET.into(),
         revision,
         qmodel_digest: [0; 32],
