@@ -133,7 +133,7 @@ fn a_foreign_image_is_refused_before_a_sector_is_erased() {
     let cases = [
         (changed(|p| p.target = "cortex-m7".into()), "compiled for target cortex-m7, this is cortex-m4"),
         (changed(|p| p.target.clear()), "compiled for target unknown, this is cortex-m4"),
-        (changed(|p| p.arena_bytes = 80), "memory region 0: needs 80 bytes of arena, there are 64"),
+        (changed(|p| p.regions[0].bytes = 80), "memory region 0: needs 80 bytes of arena, there are 64"),
         (changed(|p| p.revision = 3), "revision 3 is older than the running 4"),
         (changed(|p| p.constants = vec![0; ROOM]), "the slot has room for 4096"),
     ];
