@@ -85,6 +85,7 @@ fn work_per_call_is_bounded() {
     // The first call parses, the next ones read 64 bytes each: more than the file has, as sections are padded.
     let calls = (0..).take_while(|_| updater.finish(64).unwrap() != CheckProgress::Done).count();
     assert!(calls >= (new.len() - header::BYTES) / 64, "{calls}");
+    assert!(size_of_val(&updater) <= 512, "{} bytes", size_of_val(&updater));
     let flash = updater.into_flash();
     // A claim (erase and write), 256 bytes per write, 512 per sector, the record.
     assert_eq!(flash.operations().len(), 2 + new.len().div_ceil(256) + new.len().div_ceil(512) + 1);

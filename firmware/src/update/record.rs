@@ -120,11 +120,16 @@ impl Record {
     }
 }
 
-/// Makes the slot's image void, whatever is left of it. The image itself stays whole until there is a claim; what a
-/// broken-off update left is made unrecognizable before its claim is erased, or it could pass for the factory's.
+/// Makes the slot's image void, whatever is left of it.
+///
+/// While the record is erased, it may say anything. So what must not run (the rest of an update that was broken off, an
+/// image that was given up) loses its header first; an image that may run stays whole until there is a claim.
 pub(super) fn claim<F: NorFlash>(flash: &mut F, slots: &Slots, slot: Slot) -> Result<(), FlashError> {
-    if Record::read(flash, slots, slot) == Record::Claimed {
-        flash::erase(flash, slots.first_sector(slot))?;
+    match Record::read(flash, slots, slot) {
+        Record::Unclaimed | Record::Complete(_, Trial::Confirmed | Trial::Next(_)) => {}
+        Record::Claimed | Record::Complete(_, Trial::Failed) => {
+            flash::erase(flash, slots.first_sector(slot))?;
+        }
     }
     flash::erase(flash, slots.record(slot))?;
     write_unit(flash, slots, slot, Unit::Claim, &CLAIM)
