@@ -65,7 +65,7 @@ fn a_changed_weight_names_its_step_and_counts_its_bytes() {
     assert!(text.out.contains(&format!("{weights} B, 2 differ")), "{}", text.out);
 }
 
-/// Two targets: another packing, another arena; nothing that a step computes.
+/// Two targets: another packing, another arena, another order; nothing that a step computes.
 #[test]
 fn another_target_changes_kernels_and_places_but_no_answer() {
     for system in System::ALL {
@@ -81,7 +81,8 @@ fn another_target_changes_kernels_and_places_but_no_answer() {
         let (status, document) = folder.json("model-compiler inspect --diff @a.img @b.img --json");
         assert_eq!(status, 1, "{document}");
         let steps = list(&document, "steps");
-        assert!(steps.iter().all(|step| step["answer"] == false && step["before"] == step["after"]), "{document}");
+        let same = |step: &Value| step["answer"] == false && !step["before"].is_null() && !step["after"].is_null();
+        assert!(steps.iter().all(same), "{system:?}: {document}");
         let changed = |what: &str| {
             let fields = |step: &Value| list(step, "fields").iter().any(|field| field["what"] == what);
             steps.iter().filter(|step| fields(step)).count()

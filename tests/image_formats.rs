@@ -132,7 +132,8 @@ fn a_linker_puts_the_image_where_the_script_says() {
     assert!(assembled.status.success());
     for (format, linked) in [("elf", true), ("hex", false)] {
         folder.ok(&format!(
-            "model-compiler convert @net.img --format {format} --address 0x21000000 --linker @model.x -o @model.{format}"
+            "model-compiler convert @net.img --format {format} --address 0x21000000 --linker @model.x \
+             -o @model.{format}"
         ));
         for (linker, package) in [("arm-none-eabi-ld", package), ("ld.lld", "lld")] {
             let mut arguments = vec!["-T", "memory.ld", "program.o", "-o", "program.elf"];
@@ -208,8 +209,8 @@ fn options_that_cannot_be_met_are_refused() {
         (
             "convert @net.img --format srec --address 0xFFFFFFF0 -o @new.srec",
             format!(
-                "--address: the image's {bytes} B at 0xfffffff0 end at {:#x}, behind 32-bit addresses\n  help: choose a \
-                 lower address, or --format elf",
+                "--address: the image's {bytes} B at 0xfffffff0 end at {:#x}, behind 32-bit addresses\n  help: choose \
+                 a lower address, or --format elf",
                 0xFFFF_FFF0 + bytes
             ),
         ),

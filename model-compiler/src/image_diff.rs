@@ -1,8 +1,9 @@
 //! What changed between two images: header, ports, sections, steps and their constants.
 //!
-//! Images name no steps, so steps are matched by position where both programs have the same operators in the same
-//! order, else by operator and output shape along the longest common sequence. Positions, tensor ids and places of
-//! constants are no changes by themselves: constants are compared by content, operands by shape and type.
+//! Images name no steps. Steps that give the same bytes in the known answer are the same, wherever a schedule puts them.
+//! The rest is matched by position where it has the same operators in the same order, else by operator and output shape
+//! along the longest common sequence. Positions, tensor ids and places of constants are no changes by themselves:
+//! constants are compared by content, operands by shape and type.
 
 use crate::artifact::{hex, sha256};
 use crate::error::{Error, ErrorCode, Result};
@@ -172,24 +173,45 @@ fn program<'a>(image: &'a Image<'a>) -> Result<Vec<Placed<'a>>> {
 
 fn steps(before: &Image<'_>, after: &Image<'_>) -> Result<Vec<StepChange>> {
     let (before, after) = (program(before)?, program(after)?);
-    let ops = |program: &[Placed<'_>]| program.iter().map(|p| p.step.name()).collect::<Vec<_>>();
-    let keys = |program: &[Placed<'_>]| program.iter().map(|p| (p.step.name(), shape(&p.output))).collect::<Vec<_>>();
-    let matched = if ops(&before) == ops(&after) {
-        vec![DiffOp::Equal { old_index: 0, new_index: 0, len: before.len() }]
-    } else {
-        capture_diff_slices(Algorithm::Myers, &keys(&before), &keys(&after))
-    };
     let mut found = Vec::new();
+    let (mut rest, mut unmatched): (Vec<&Placed<'_>>, Vec<&Placed<'_>>) = (Vec::new(), after.iter().collect());
+    for step in &before {
+        match unmatched.iter().position(|other| step.is_the_same(other)) {
+            Some(same) => found.extend(changed_step(step, unmatched.remove(same))?),
+            None => rest.push(step),
+        }
+    }
+    let ops = |steps: &[&Placed<'_>]| steps.iter().map(|p| p.step.name()).collect::<Vec<_>>();
+    let keys = |steps: &[&Placed<'_>]| steps.iter().map(|p| (p.step.name(), shape(&p.output))).collect::<Vec<_>>();
+    let matched = if ops(&rest) == ops(&unmatched) {
+        vec![DiffOp::Equal { old_index: 0, new_index: 0, len: rest.len() }]
+    } else {
+        capture_diff_slices(Algorithm::Myers, &keys(&rest), &keys(&unmatched))
+    };
     for operation in matched {
         let (_, old, new) = operation.as_tag_tuple();
         let pairs = if matches!(operation, DiffOp::Equal { .. }) { old.len() } else { 0 };
-        for (a, b) in before[old.clone()].iter().zip(&after[new.clone()]).take(pairs) {
+        for (a, b) in rest[old.clone()].iter().zip(&unmatched[new.clone()]).take(pairs) {
             found.extend(changed_step(a, b)?);
         }
-        found.extend(before[old].iter().skip(pairs).map(|step| lone_step(Some(step), None)));
-        found.extend(after[new].iter().skip(pairs).map(|step| lone_step(None, Some(step))));
+        found.extend(rest[old].iter().skip(pairs).map(|step| lone_step(Some(step), None)));
+        found.extend(unmatched[new].iter().skip(pairs).map(|step| lone_step(None, Some(step))));
     }
+    found.sort_by_key(|change| (change.after.or(change.before), change.before));
     Ok(found)
+}
+
+impl Placed<'_> {
+    /// CRC-32 of its output in the known answer.
+    fn answer(&self) -> Option<u32> {
+        self.image.known_answer().and_then(|answer| answer.step_crc(self.position))
+    }
+
+    /// Same operator, output and answer.
+    fn is_the_same(&self, other: &Self) -> bool {
+        let same_output = shape(&self.output) == shape(&other.output) && self.answer() == other.answer();
+        same_output && self.answer().is_some() && self.step.name() == other.step.name()
+    }
 }
 
 fn lone_step(before: Option<&Placed<'_>>, after: Option<&Placed<'_>>) -> StepChange {
@@ -214,14 +236,13 @@ fn changed_step(before: &Placed<'_>, after: &Placed<'_>) -> Result<Option<StepCh
         let offset = ("arena offset".to_owned(), placed.output.offset.to_string());
         Ok([operands, fields.numbers.clone(), vec![offset]].concat())
     };
-    let answer = |placed: &Placed<'_>| placed.image.known_answer().and_then(|a| a.step_crc(placed.position));
     let change = StepChange {
         op: before.step.name(),
         before: Some(before.position),
         after: Some(after.position),
         fields: changes(&facts(before, &a)?, &facts(after, &b)?),
         constants: constants(before, &a, after, &b)?,
-        answer: answer(before) != answer(after),
+        answer: before.answer() != after.answer(),
     };
     Ok((!change.fields.is_empty() || !change.constants.is_empty() || change.answer).then_some(change))
 }
