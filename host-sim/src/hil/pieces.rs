@@ -1,0 +1,242 @@
+//! From the files of a moment to the messages that carry them: rows of images, points, tensors.
+
+use crate::drive::log::{self, LoggedFrame};
+use firmware::drive::{Command, Measurements, NetworkInputs, Reading};
+use firmware::image::Image;
+use firmware::link::{CameraSetup, End, MAX_PIECE, Request};
+use firmware::sensors::camera::{PixelFormat, Scale};
+use firmware::sensors::lidar::Axes;
+use firmware::sensors::views::View;
+use firmware::tensor::Shape;
+use fixed::types::{I8F8, I16F16};
+use image::RgbImage;
+use model_compiler::error::{Error, ErrorCode, Result};
+use model_compiler::frames::{Frame, camera};
+use model_compiler::integer_reference::encode_input;
+use model_compiler::ir::InputKind;
+use std::path::Path;
+
+/// Files of the cameras, in the order of [`View::LBC`].
+const CAMERAS: [&str; 3] = ["rgb.png", "rgb_left.png", "rgb_right.png"];
+const LIDAR: &str = "lidar.bin";
+/// Red, green, blue.
+const PIXEL_BYTES: usize = 3;
+/// x, y, z, intensity as little-endian f32; the last stays here.
+const RECORD_BYTES: usize = 16;
+const POINT_BYTES: usize = 12;
+
+/// A part of a frame.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Piece {
+    /// See [`Request::Row`].
+    Row { view: View, row: u16, offset: u32, bytes: Vec<u8> },
+    /// See [`Request::Points`].
+    Points(Vec<u8>),
+    /// See [`Request::Input`].
+    Input { input: u8, offset: u32, bytes: Vec<u8> },
+}
+
+impl Piece {
+    /// As a message.
+    pub fn request(&self) -> Request<'_> {
+        match self {
+            Self::Row { view, row, offset, bytes } => Request::Row { view: *view, row: *row, offset: *offset, bytes },
+            Self::Points(bytes) => Request::Points(bytes),
+            Self::Input { input, offset, bytes } => Request::Input { input: *input, offset: *offset, bytes },
+        }
+    }
+
+    /// For messages.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Row { view, row, offset, .. } => format!("row {row} of camera {view:?} from byte {offset} on"),
+            Self::Points(bytes) => format!("{} LiDAR points", bytes.len() / POINT_BYTES),
+            Self::Input { input, offset, .. } => format!("input {input} from byte {offset} on"),
+        }
+    }
+}
+
+/// How the sensors sit on the vehicle.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Setup {
+    /// Columns and rows of the cameras' images.
+    pub image: [u16; 2],
+    /// Axes of the LiDAR.
+    pub lidar_axes: Axes,
+    /// Its height, m.
+    pub lidar_height: I16F16,
+}
+
+impl Setup {
+    /// The cameras, which are never taken for frozen: recordings of a standing vehicle repeat their images.
+    pub const fn camera(&self) -> CameraSetup {
+        let [width, height] = self.image;
+        CameraSetup { width, height, format: PixelFormat::Rgb, scale: Scale::Full, frozen_after: 0 }
+    }
+}
+
+/// One moment as a board is told it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Parcel {
+    /// What the sensors must be for it.
+    pub setup: Setup,
+    /// Its data.
+    pub pieces: Vec<Piece>,
+    /// What is to be done with them.
+    pub end: End,
+}
+
+/// What an image reads, as far as sensors are concerned.
+#[derive(Clone, Copy, Debug)]
+pub struct Reads {
+    /// Size of the crop, and whether three views are read.
+    camera: Option<(Shape, bool)>,
+    lidar: bool,
+}
+
+impl Reads {
+    /// Of an image's inputs.
+    pub fn of_image(image: &Image<'_>) -> Self {
+        let ports = || (0..image.input_count()).filter_map(|index| image.input(index));
+        let shape = |name: &str| {
+            ports().find(|port| port.name == name).and_then(|port| image.tensor(port.tensor)).map(|record| record.shape)
+        };
+        let views = shape("views").map(|shape| (shape, true));
+        let camera = views.or_else(|| shape("rgb").map(|shape| (shape, false)));
+        let lidar = ports().any(|port| matches!(port.name, "bev" | "bev_points" | "cam_points"));
+        Self { camera, lidar }
+    }
+
+    /// Sensor data of a frame folder; the network runs on exactly this speed, goal and command.
+    ///
+    /// # Errors
+    /// A file is missing or damaged.
+    pub fn frame(&self, folder: &Path, frame: &Frame) -> Result<Parcel> {
+        let (lidar_axes, lidar_height) = log::lidar(folder)?;
+        let mut pieces = Vec::new();
+        let image = self.rows(folder, &mut pieces)?;
+        if self.lidar {
+            points(&folder.join(LIDAR), &mut pieces)?;
+        }
+        let end = End::Infer(Some(network_inputs(frame)));
+        Ok(Parcel { setup: Setup { image, lidar_axes, lidar_height }, pieces, end })
+    }
+
+    /// A step of a log.
+    ///
+    /// # Errors
+    /// A file of a sensor that is not missing is, or is damaged.
+    pub fn step(&self, frame: &LoggedFrame) -> Result<Parcel> {
+        let Measurements { camera, lidar, .. } = frame.measurements;
+        let mut pieces = Vec::new();
+        let image = if is_there(camera) { self.rows(&frame.folder, &mut pieces)? } else { self.crop_size() };
+        if self.lidar && is_there(lidar) {
+            points(&frame.folder.join(LIDAR), &mut pieces)?;
+        }
+        let setup = Setup { image, lidar_axes: frame.lidar_axes, lidar_height: frame.lidar_height };
+        Ok(Parcel { setup, pieces, end: End::Drive(frame.measurements) })
+    }
+
+    /// Rows of all cameras, as far as the crop needs them; the images' size.
+    fn rows(&self, folder: &Path, pieces: &mut Vec<Piece>) -> Result<[u16; 2]> {
+        let Some((crop, has_views)) = self.camera else { return Ok(self.crop_size()) };
+        let mut size = None;
+        for (view, file) in View::LBC.into_iter().zip(CAMERAS).take(if has_views { 3 } else { 1 }) {
+            let path = folder.join(file);
+            let image = camera::decode(&path)?;
+            let found = sides(&image, &path)?;
+            let expected = *size.get_or_insert(found);
+            if found != expected {
+                let [found, expected] = [found, expected].map(|[w, h]| format!("{w}×{h}"));
+                let message = format!("the image is {found}, the first camera's {expected}");
+                return Err(Error::new(ErrorCode::Frames, path.display().to_string(), message)
+                    .with_help("all cameras of a vehicle are alike"));
+            }
+            cut(&image, view, crop, pieces);
+        }
+        Ok(size.unwrap_or_else(|| self.crop_size()))
+    }
+
+    /// The smallest image: for a board that gets none.
+    fn crop_size(&self) -> [u16; 2] {
+        self.camera.map_or([1, 1], |(shape, _)| [shape.width, shape.height])
+    }
+
+    /// The setup of a board that gets the network's inputs themselves.
+    pub fn without_sensors(&self) -> Setup {
+        Setup { image: self.crop_size(), lidar_axes: Axes::Carla, lidar_height: I16F16::lit("2.5") }
+    }
+}
+
+/// The network's inputs themselves, in place of what sensors would give.
+pub fn inputs(setup: Setup, inputs: &[Vec<u8>]) -> Parcel {
+    let piece = |input: usize, (number, bytes): (usize, &[u8])| Piece::Input {
+        input: u8::try_from(input).unwrap_or(u8::MAX),
+        offset: (number * MAX_PIECE) as u32,
+        bytes: bytes.to_vec(),
+    };
+    let pieces = inputs.iter().enumerate();
+    let pieces = pieces.flat_map(|(input, bytes)| bytes.chunks(MAX_PIECE).enumerate().map(move |part| piece(input, part)));
+    Parcel { setup, pieces: pieces.collect(), end: End::Infer(None) }
+}
+
+/// Speed, goal and command in the codes of the network's inputs; what the frame does not tell is zero or the lane.
+fn network_inputs(frame: &Frame) -> NetworkInputs {
+    let codes = |kind, values: &[f64]| encode_input(kind, &values.iter().map(|&v| f64::from(v as f32)).collect::<Vec<_>>());
+    let goal = codes(InputKind::Goal, &frame.goal.or(frame.target).unwrap_or_default());
+    let velocity = codes(InputKind::Velocity, &[frame.speed.unwrap_or_default()]);
+    NetworkInputs {
+        goal: [0, 1].map(|axis| I16F16::from_bits(goal[axis] as i32)),
+        velocity: I8F8::from_bits(velocity[0] as i16),
+        command: frame.command.and_then(Command::from_code).unwrap_or(Command::LaneFollow),
+    }
+}
+
+const fn is_there(reading: Reading<()>) -> bool {
+    matches!(reading, Reading::Value { .. })
+}
+
+fn sides(image: &RgbImage, path: &Path) -> Result<[u16; 2]> {
+    let side = |side: u32| u16::try_from(side).ok();
+    let sides = side(image.width()).zip(side(image.height()));
+    sides.map(|(width, height)| [width, height]).ok_or_else(|| {
+        let message = format!("the image is {}×{}, a side is at most {}", image.width(), image.height(), u16::MAX);
+        Error::new(ErrorCode::Frames, path.display().to_string(), message)
+    })
+}
+
+/// The part of an image that the crop at its center needs, piece by piece. Of a smaller image that is all of it; the
+/// board then says what it lacks.
+fn cut(image: &RgbImage, view: View, crop: Shape, pieces: &mut Vec<Piece>) {
+    let [width, height] = [image.width() as usize, image.height() as usize];
+    let span = |whole: usize, part: usize| whole.saturating_sub(part) / 2..(whole.saturating_sub(part) / 2 + part).min(whole);
+    let (rows, columns) = (span(height, crop.height.into()), span(width, crop.width.into()));
+    let row_bytes = columns.start * PIXEL_BYTES..columns.end * PIXEL_BYTES;
+    for row in rows {
+        let bytes = &image.as_raw()[row * width * PIXEL_BYTES..][row_bytes.clone()];
+        // A piece holds whole pixels.
+        let parts = bytes.chunks(MAX_PIECE / PIXEL_BYTES * PIXEL_BYTES);
+        let mut offset = row_bytes.start;
+        for part in parts {
+            pieces.push(Piece::Row { view, row: row as u16, offset: offset as u32, bytes: part.to_vec() });
+            offset += part.len();
+        }
+    }
+}
+
+/// The points of a sweep; a sweep without any is one message without any.
+fn points(path: &Path, pieces: &mut Vec<Piece>) -> Result<()> {
+    let bytes = std::fs::read(path).map_err(|e| Error::io(path, &e))?;
+    let (records, rest) = bytes.as_chunks::<RECORD_BYTES>();
+    if !rest.is_empty() {
+        let message =
+            format!("{} bytes, expected a multiple of {RECORD_BYTES} (x, y, z, intensity as f32)", bytes.len());
+        return Err(Error::new(ErrorCode::Frames, path.display().to_string(), message).with_help("is it truncated?"));
+    }
+    let points: Vec<u8> = records.iter().flat_map(|record| &record[..POINT_BYTES]).copied().collect();
+    if points.is_empty() {
+        pieces.push(Piece::Points(Vec::new()));
+    }
+    pieces.extend(points.chunks(MAX_PIECE / POINT_BYTES * POINT_BYTES).map(|part| Piece::Points(part.to_vec())));
+    Ok(())
+}
