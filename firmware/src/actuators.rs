@@ -79,7 +79,7 @@ impl<S: SetDutyCycle, T: SetDutyCycle, B: SetDutyCycle, E: OutputPin> Actuate fo
         let controls = output.controls;
         let is_enabled = output.status == Status::Driving;
         let duties = Duties {
-            steering: duty(controls.steer.saturating_add(Real::ONE) / 2, self.steering.max_duty_cycle()),
+            steering: duty(controls.steer.saturating_add(Real::ONE) >> 1, self.steering.max_duty_cycle()),
             throttle: duty(controls.throttle, self.throttle.max_duty_cycle()),
             brake: duty(controls.brake, self.brake.max_duty_cycle()),
             is_enabled,

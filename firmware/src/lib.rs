@@ -25,6 +25,7 @@
 //!
 //! # Layers, top first
 //!
+//! * [`computer`]: the whole driving computer behind a serial [`link`]: frames in, [`actuators`] set, telemetry out.
 //! * [`drive`]: around the network: route, goal, waypoints to steer, throttle and brake, supervision. Fixed point.
 //! * [`engine`]: `start`, `step`, `infer`, self-test. Owns nothing but a position.
 //! * [`ops`]: one operator per file: what its step must satisfy, and how it becomes a call of a kernel.
@@ -58,6 +59,7 @@ compile_error!("model images are little-endian and executed in place");
 
 pub mod actuators;
 pub mod arena;
+pub mod computer;
 #[cfg(any(test, feature = "conformance"))]
 pub mod conformance;
 pub mod drive;

@@ -1,6 +1,5 @@
 //! What a board answers.
 
-use super::Damage;
 use crate::actuators::{ActuatorFault, Duties};
 use crate::drive::{Controls, Counters, Status};
 use crate::waypoint::{MAX_WAYPOINTS, Waypoint};
@@ -84,10 +83,10 @@ pub struct Telemetry {
     pub frame: u32,
     /// What the controls are.
     pub status: Status,
-    /// What the actuators were told.
+    /// What the actuators were told, or would have been.
     pub controls: Controls,
-    /// What the actuators were set to.
-    pub duties: Result<Duties, ActuatorFault>,
+    /// What the actuators were set to; `None` where the frame was not driven but only run through the network.
+    pub duties: Option<Result<Duties, ActuatorFault>>,
     /// What the network answered.
     pub answer: Answer,
     /// Ticks of the board's clock that the network's steps took; 0 where it did not run.
@@ -126,6 +125,8 @@ pub struct LinkCounters {
     pub damaged: u32,
     /// Packets missing in the sequence, the damaged ones included.
     pub lost: u32,
+    /// Packets that came again, or too late; they are left out.
+    pub repeated: u32,
     /// Bytes that found the board's buffer full while the network ran.
     pub overflowed: u32,
     /// Frames that were not driven for what was lost in them.
@@ -138,8 +139,8 @@ pub struct LinkCounters {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Refusal {
-    /// The packet arrived, but is no request of this protocol.
-    Message,
+    /// There is no image to run: it is damaged, or not for this board.
+    NoImage,
     /// A piece or an end of a frame without a begin, or after a loss that cost it.
     NoFrame,
     /// The frame's number is not above the one before.
@@ -173,7 +174,7 @@ pub enum Refusal {
 impl fmt::Display for Refusal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::Message => Damage::Message.fmt(f),
+            Self::NoImage => f.write_str("the board's image is damaged, or not for this board"),
             Self::NoFrame => f.write_str("no frame was begun, or what was lost cost its begin"),
             Self::OldFrame { last } => write!(f, "the frame's number is not above the last one, {last}"),
             Self::Untested => f.write_str("the board did not meet the image's known answer yet"),

@@ -125,7 +125,7 @@ impl CameraLayout {
         }
     }
 
-    fn check(&self) -> Result<(), LayoutError> {
+    pub(crate) fn check(&self) -> Result<(), LayoutError> {
         let (found, map) = ([self.width, self.height], self.map);
         let needed = [map.width, map.height].map(|side| u32::from(side) << self.scale.bits());
         if needed.into_iter().zip(found).any(|(needed, found)| needed == 0 || needed > u32::from(found)) {
