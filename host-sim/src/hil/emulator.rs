@@ -114,38 +114,36 @@ pub struct Emulator {
     board: Board,
     child: Child,
     errors: Option<JoinHandle<String>>,
-    log: Option<NamedTempFile>,
+    log: NamedTempFile,
     program: PathBuf,
 }
 
 impl Emulator {
-    /// Starts a board with an image in its memory: the emulator, and the line to its UART. `logs`: keeps what the
-    /// program writes by semihosting.
+    /// Starts a board with an image in its memory: the emulator, and the line to its UART. What the
+    /// program writes by semihosting goes to a file.
     ///
     /// # Errors
     /// Program or emulator is missing.
-    pub fn start(board: Board, program: Option<&Path>, image: &Path, logs: bool) -> Result<(Self, Line)> {
+    pub fn start(board: Board, program: Option<&Path>, image: &Path) -> Result<(Self, Line)> {
         let program = program.map_or_else(|| board.program(), Path::to_path_buf);
         if !program.is_file() {
             return Err(board.no_program(&program));
         }
-        let log = logs.then(NamedTempFile::new).transpose().map_err(|e| Error::io(&std::env::temp_dir(), &e))?;
-        let mut command = Command::new(board.emulator());
-        command
+        let log = NamedTempFile::new().map_err(|e| Error::io(&std::env::temp_dir(), &e))?;
+        let mut child = Command::new(board.emulator())
             .arg("-M")
             .args(board.machine())
             .args(["-display", "none", "-monitor", "none", "-serial", "stdio", "-icount", "shift=6", "-device"])
             .arg(format!("loader,file={},addr={:#x},force-raw=on", escaped(image), board.image_address()))
-            .args(["-semihosting-config", &semihosting(log.as_ref())])
+            .args(["-semihosting-config", "enable=on,target=native,chardev=log", "-chardev"])
+            .arg(format!("file,id=log,path={}", escaped(log.path())))
             .arg("-kernel")
             .arg(&program)
             .stdin(Stdio::piped())
             .stdout(Stdio::piped())
-            .stderr(Stdio::piped());
-        if let Some(log) = &log {
-            command.arg("-chardev").arg(format!("file,id=log,path={}", escaped(log.path())));
-        }
-        let mut child = command.spawn().map_err(|e| board.no_emulator(&e))?;
+            .stderr(Stdio::piped())
+            .spawn()
+            .map_err(|e| board.no_emulator(&e))?;
         let streams = (child.stdin.take(), child.stdout.take(), child.stderr.take());
         let mut emulator = Self { board, child, errors: None, log, program };
         let (Some(to_board), Some(from_board), Some(mut errors)) = streams else {
@@ -193,8 +191,7 @@ impl Emulator {
     /// # Errors
     /// The file is gone.
     pub fn log(&self) -> Result<Vec<u8>> {
-        let Some(log) = &self.log else { return Ok(Vec::new()) };
-        std::fs::read(log.path()).map_err(|e| Error::io(log.path(), &e))
+        std::fs::read(self.log.path()).map_err(|e| Error::io(self.log.path(), &e))
     }
 
     fn wait(&mut self, timeout: Duration) -> Option<ExitStatus> {
@@ -226,10 +223,6 @@ impl Drop for Emulator {
     }
 }
 
-fn semihosting(log: Option<&NamedTempFile>) -> String {
-    format!("enable=on,target=native{}", if log.is_some() { ",chardev=log" } else { "" })
-}
-
 /// A path in an option of the emulator, where a comma ends a value unless it is doubled.
 fn escaped(path: &Path) -> String {
     path.display().to_string().replace(',', ",,")
@@ -250,7 +243,7 @@ mod tests {
     #[test]
     fn a_missing_program_says_how_to_build_it() {
         let path = Path::new("/nowhere/virt-drive");
-        let error = Emulator::start(Board::Virt, Some(path), Path::new("a.img"), false).unwrap_err();
+        let error = Emulator::start(Board::Virt, Some(path), Path::new("a.img")).unwrap_err();
         assert_eq!((error.location.as_str(), error.code.exit_status()), ("/nowhere/virt-drive", 2));
         assert!(error.help.contains("--target aarch64-unknown-none"), "{error}");
     }

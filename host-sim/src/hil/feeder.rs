@@ -61,25 +61,40 @@ impl<'l> Feeder<'l> {
     /// of something.
     ///
     /// # Errors
-    /// Nobody answers.
+    /// Nobody answers, or not in this protocol.
     pub fn identify(&mut self) -> Result<Packet> {
         let begin = Instant::now();
+        let mut strange = false;
         // Ends whatever the board was receiving.
         self.line.send(&[0]);
         while begin.elapsed() < self.timeout {
             self.send(&Request::Identify, "Identify")?;
             let asked = Instant::now();
-            while asked.elapsed() < RETRY {
+            while asked.elapsed() < RETRY.min(self.timeout) {
                 // What is left of an earlier conversation is nobody's loss.
-                if let Some(Ok(packet)) = self.next_within(RETRY.min(self.timeout))?
-                    && let Ok(packet) = self.check(packet, false)
-                    && matches!(packet.response(), Response::Identity(_))
-                {
-                    return Ok(packet);
+                let Some(Ok(bytes)) = self.next_within(RETRY.min(self.timeout))? else { continue };
+                let Ok((sequence, response)) = decode::<Response<'_>>(&bytes) else {
+                    strange = true;
+                    continue;
+                };
+                match response {
+                    Response::Identity(_) => {
+                        self.expected = Some(sequence.wrapping_add(1));
+                        return Ok(Packet(bytes));
+                    }
+                    Response::Refused { request, reason: Refusal::NoImage } => {
+                        return Err(self.refused(request, Refusal::NoImage));
+                    }
+                    _ => {}
                 }
             }
         }
-        Err(self.silent())
+        if !strange {
+            return Err(self.silent());
+        }
+        let message = "what comes is no answer of this protocol";
+        Err(Error::new(ErrorCode::Link, self.line.name(), message)
+            .with_help("check the rate of the line (--baud), and that board and host-sim are of one version"))
     }
 
     /// Sends a request; its number.
@@ -104,7 +119,7 @@ impl<'l> Feeder<'l> {
     /// # Errors
     /// It is refused, or not answered.
     pub fn ask(&mut self, request: &Request<'_>, what: impl Into<String>) -> Result<()> {
-        self.try_ask(request, what)?.map_err(|reason| self.refused(self.sequence.wrapping_sub(1), reason))
+        self.try_ask(request, what)?.map_err(|reason| self.refused_last(reason))
     }
 
     /// The same, where the caller knows what to do about a refusal.
@@ -140,7 +155,7 @@ impl<'l> Feeder<'l> {
         match self.next_within(self.timeout)? {
             None => Err(self.silent()),
             Some(Err(damage)) => Err(self.damaged(damage)),
-            Some(Ok(bytes)) => self.check(bytes, true),
+            Some(Ok(bytes)) => self.check(bytes),
         }
     }
 
@@ -150,6 +165,11 @@ impl<'l> Feeder<'l> {
         let what = what.map_or_else(|| format!("request {request}"), |(_, what)| what.clone());
         Error::new(ErrorCode::Link, self.line.name(), format!("the board refuses {what}: {reason}"))
             .with_help(remedy(reason))
+    }
+
+    /// Why the last request was not carried out.
+    pub fn refused_last(&self, reason: Refusal) -> Error {
+        self.refused(self.sequence.wrapping_sub(1), reason)
     }
 
     fn next_within(&mut self, timeout: Duration) -> Result<Option<std::result::Result<Vec<u8>, Damage>>> {
@@ -162,25 +182,23 @@ impl<'l> Feeder<'l> {
         Ok(self.arrived.pop_front())
     }
 
-    /// A packet that is whole and, where that is asked for, the next one.
-    fn check(&mut self, bytes: Vec<u8>, in_order: bool) -> Result<Packet> {
+    /// A packet that is whole and the next one.
+    fn check(&mut self, bytes: Vec<u8>) -> Result<Packet> {
         let decoded = decode::<Response<'_>>(&bytes).map(|(sequence, _)| sequence);
         let sequence = decoded.map_err(|damage| self.damaged(damage))?;
-        let expected = self.expected.replace(sequence.wrapping_add(1));
-        match expected.filter(|_| in_order).map_or(0, |expected| sequence.wrapping_sub(expected)) {
+        let expected = self.expected.replace(sequence.wrapping_add(1)).unwrap_or(sequence);
+        match sequence.wrapping_sub(expected) {
             0 => Ok(Packet(bytes)),
-            lost => {
-                let message = format!("answers were lost on the line: packet {sequence} came {lost} too early");
-                Err(self.faulty(message))
-            }
+            lost => Err(self.faulty(&format!("answers were lost on the line: packet {sequence} came {lost} too early"))),
         }
     }
 
     fn damaged(&self, damage: Damage) -> Error {
-        self.faulty(format!("an answer is damaged: {damage}"))
+        self.faulty(&format!("an answer is damaged: {damage}"))
     }
 
-    fn faulty(&self, message: String) -> Error {
+    /// Something about the line that should not be.
+    pub fn faulty(&self, message: &str) -> Error {
         Error::new(ErrorCode::Link, self.line.name(), message)
             .with_help("check that both ends use the same rate, or lower it; look at cable and ground")
     }
@@ -200,7 +218,7 @@ fn remedy(reason: Refusal) -> &'static str {
         Refusal::Configuration => "the camera's image must not be smaller than the network's crop",
         Refusal::NoSuchSensor | Refusal::InputsMissing => "--crop sends the network's inputs in place of the sensors' data",
         Refusal::NoDriver => "only a driving network follows a log; --frames and --inputs run any network",
-        Refusal::Message => "board and host-sim must be of one version",
+        Refusal::NoImage => "flash the image; firmware/boards/README.md says what fits which board",
         _ => "",
     }
 }

@@ -1,6 +1,6 @@
 //! From the files of a moment to the messages that carry them: rows of images, points, tensors.
 
-use crate::drive::log::{self, LoggedFrame};
+use crate::drive::log::{Description, LoggedFrame};
 use firmware::drive::{Command, Measurements, NetworkInputs, Reading};
 use firmware::image::Image;
 use firmware::link::{CameraSetup, End, MAX_PIECE, Request};
@@ -25,8 +25,9 @@ const PIXEL_BYTES: usize = 3;
 const RECORD_BYTES: usize = 16;
 const POINT_BYTES: usize = 12;
 
-/// A part of a frame.
+/// A part of a frame, with the fields of its message.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[allow(missing_docs, reason = "see `Request`")]
 pub enum Piece {
     /// See [`Request::Row`].
     Row { view: View, row: u16, offset: u32, bytes: Vec<u8> },
@@ -56,22 +57,30 @@ impl Piece {
     }
 }
 
-/// How the sensors sit on the vehicle.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+/// What a moment says about the sensors; `None` where it has nothing of theirs.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Setup {
     /// Columns and rows of the cameras' images.
-    pub image: [u16; 2],
-    /// Axes of the LiDAR.
-    pub lidar_axes: Axes,
-    /// Its height, m.
-    pub lidar_height: I16F16,
+    pub image: Option<[u16; 2]>,
+    /// Axes of the LiDAR, and its height, m.
+    pub lidar: Option<(Axes, I16F16)>,
 }
 
 impl Setup {
-    /// The cameras, which are never taken for frozen: recordings of a standing vehicle repeat their images.
-    pub const fn camera(&self) -> CameraSetup {
-        let [width, height] = self.image;
-        CameraSetup { width, height, format: PixelFormat::Rgb, scale: Scale::Full, frozen_after: 0 }
+    /// This, and what only the other one says.
+    #[must_use]
+    pub fn or(self, other: Self) -> Self {
+        Self { image: self.image.or(other.image), lidar: self.lidar.or(other.lidar) }
+    }
+
+    /// Whether nothing is left to know.
+    pub const fn is_whole(self) -> bool {
+        self.image.is_some() && self.lidar.is_some()
+    }
+
+    /// Whether a board that is set up so can take a moment that needs `other`.
+    pub fn serves(self, other: Self) -> bool {
+        other.or(self) == self
     }
 }
 
@@ -89,7 +98,7 @@ pub struct Parcel {
 /// What an image reads, as far as sensors are concerned.
 #[derive(Clone, Copy, Debug)]
 pub struct Reads {
-    /// Size of the crop, and whether three views are read.
+    /// The map that cameras fill, and whether three of them do.
     camera: Option<(Shape, bool)>,
     lidar: bool,
 }
@@ -107,19 +116,31 @@ impl Reads {
         Self { camera, lidar }
     }
 
+    /// The cameras as a board is to know them. They are never taken for frozen: recordings of a standing vehicle repeat
+    /// their images. Without an image its size is the network's.
+    pub fn camera(&self, setup: Setup) -> CameraSetup {
+        let map = self.camera.map_or(Shape::map(1, 1, 3), |(shape, _)| shape);
+        let [width, height] = setup.image.unwrap_or([map.width, map.height]);
+        let format = if map.channels == 1 { PixelFormat::Grey } else { PixelFormat::Rgb };
+        CameraSetup { width, height, format, scale: Scale::Full, frozen_after: 0 }
+    }
+
     /// Sensor data of a frame folder; the network runs on exactly this speed, goal and command.
     ///
     /// # Errors
     /// A file is missing or damaged.
     pub fn frame(&self, folder: &Path, frame: &Frame) -> Result<Parcel> {
-        let (lidar_axes, lidar_height) = log::lidar(folder)?;
+        let description = Description::of_folder(folder)?;
         let mut pieces = Vec::new();
         let image = self.rows(folder, &mut pieces)?;
+        let lidar = self.lidar.then(|| description.lidar()).transpose()?;
         if self.lidar {
             points(&folder.join(LIDAR), &mut pieces)?;
         }
-        let end = End::Infer(Some(network_inputs(frame)));
-        Ok(Parcel { setup: Setup { image, lidar_axes, lidar_height }, pieces, end })
+        // In the file forward is positive; in the network's frame it is negative.
+        let goal = description.goal().map_or([0.0; 2], |[right, forward]| [right, 0.0 - forward]);
+        let end = End::Infer(Some(network_inputs(frame, goal)));
+        Ok(Parcel { setup: Setup { image, lidar }, pieces, end })
     }
 
     /// A step of a log.
@@ -128,20 +149,22 @@ impl Reads {
     /// A file of a sensor that is not missing is, or is damaged.
     pub fn step(&self, frame: &LoggedFrame) -> Result<Parcel> {
         let Measurements { camera, lidar, .. } = frame.measurements;
-        let mut pieces = Vec::new();
-        let image = if is_there(camera) { self.rows(&frame.folder, &mut pieces)? } else { self.crop_size() };
+        let (mut pieces, mut setup) = (Vec::new(), Setup::default());
+        if is_there(camera) {
+            setup.image = self.rows(&frame.folder, &mut pieces)?;
+        }
         if self.lidar && is_there(lidar) {
+            setup.lidar = Some((frame.lidar_axes, frame.lidar_height));
             points(&frame.folder.join(LIDAR), &mut pieces)?;
         }
-        let setup = Setup { image, lidar_axes: frame.lidar_axes, lidar_height: frame.lidar_height };
         Ok(Parcel { setup, pieces, end: End::Drive(frame.measurements) })
     }
 
     /// Rows of all cameras, as far as the crop needs them; the images' size.
-    fn rows(&self, folder: &Path, pieces: &mut Vec<Piece>) -> Result<[u16; 2]> {
-        let Some((crop, has_views)) = self.camera else { return Ok(self.crop_size()) };
+    fn rows(&self, folder: &Path, pieces: &mut Vec<Piece>) -> Result<Option<[u16; 2]>> {
+        let Some((crop, has_views)) = self.camera else { return Ok(None) };
         let mut size = None;
-        for (view, file) in View::LBC.into_iter().zip(CAMERAS).take(if has_views { 3 } else { 1 }) {
+        for (view, file) in View::LBC.into_iter().zip(CAMERAS).take(if has_views { CAMERAS.len() } else { 1 }) {
             let path = folder.join(file);
             let image = camera::decode(&path)?;
             let found = sides(&image, &path)?;
@@ -154,22 +177,12 @@ impl Reads {
             }
             cut(&image, view, crop, pieces);
         }
-        Ok(size.unwrap_or_else(|| self.crop_size()))
-    }
-
-    /// The smallest image: for a board that gets none.
-    fn crop_size(&self) -> [u16; 2] {
-        self.camera.map_or([1, 1], |(shape, _)| [shape.width, shape.height])
-    }
-
-    /// The setup of a board that gets the network's inputs themselves.
-    pub fn without_sensors(&self) -> Setup {
-        Setup { image: self.crop_size(), lidar_axes: Axes::Carla, lidar_height: I16F16::lit("2.5") }
+        Ok(size)
     }
 }
 
 /// The network's inputs themselves, in place of what sensors would give.
-pub fn inputs(setup: Setup, inputs: &[Vec<u8>]) -> Parcel {
+pub fn inputs(inputs: &[Vec<u8>]) -> Parcel {
     let piece = |input: usize, (number, bytes): (usize, &[u8])| Piece::Input {
         input: u8::try_from(input).unwrap_or(u8::MAX),
         offset: (number * MAX_PIECE) as u32,
@@ -177,13 +190,14 @@ pub fn inputs(setup: Setup, inputs: &[Vec<u8>]) -> Parcel {
     };
     let pieces = inputs.iter().enumerate();
     let pieces = pieces.flat_map(|(input, bytes)| bytes.chunks(MAX_PIECE).enumerate().map(move |part| piece(input, part)));
-    Parcel { setup, pieces: pieces.collect(), end: End::Infer(None) }
+    Parcel { setup: Setup::default(), pieces: pieces.collect(), end: End::Infer(None) }
 }
 
-/// Speed, goal and command in the codes of the network's inputs; what the frame does not tell is zero or the lane.
-fn network_inputs(frame: &Frame) -> NetworkInputs {
+/// Speed, goal and command in the codes of the network's inputs. What the frame does not tell is zero, or to follow the
+/// lane.
+fn network_inputs(frame: &Frame, goal: [f64; 2]) -> NetworkInputs {
     let codes = |kind, values: &[f64]| encode_input(kind, &values.iter().map(|&v| f64::from(v as f32)).collect::<Vec<_>>());
-    let goal = codes(InputKind::Goal, &frame.goal.or(frame.target).unwrap_or_default());
+    let goal = codes(InputKind::Goal, &goal);
     let velocity = codes(InputKind::Velocity, &[frame.speed.unwrap_or_default()]);
     NetworkInputs {
         goal: [0, 1].map(|axis| I16F16::from_bits(goal[axis] as i32)),

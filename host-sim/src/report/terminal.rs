@@ -12,12 +12,14 @@ use std::fmt::Write;
 mod attention;
 mod bench;
 mod drive;
+mod hil;
 mod run;
 mod score;
 
 pub use attention::attention;
 pub use bench::bench;
 pub use drive::drive;
+pub use hil::hil;
 pub use run::run;
 pub use score::score;
 
