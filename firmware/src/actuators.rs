@@ -78,8 +78,10 @@ impl<S: SetDutyCycle, T: SetDutyCycle, B: SetDutyCycle, E: OutputPin> Actuate fo
     fn apply(&mut self, output: &Output) -> Result<Duties, ActuatorFault> {
         let controls = output.controls;
         let is_enabled = output.status == Status::Driving;
+        // −1..=1 to 0..=1.
+        let steering = Real::from_bits(controls.steer.saturating_add(Real::ONE).to_bits() >> 1);
         let duties = Duties {
-            steering: duty(controls.steer.saturating_add(Real::ONE) >> 1, self.steering.max_duty_cycle()),
+            steering: duty(steering, self.steering.max_duty_cycle()),
             throttle: duty(controls.throttle, self.throttle.max_duty_cycle()),
             brake: duty(controls.brake, self.brake.max_duty_cycle()),
             is_enabled,

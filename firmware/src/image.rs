@@ -69,8 +69,8 @@ pub mod layout;
 mod parse;
 mod records;
 
-pub(crate) use checker::crc32_digest;
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
+pub(crate) use checker::{Digest, digest};
 pub use checks::{Check, ParseError, Place};
 pub(crate) use checks::{ensure, ensure_equal, shown};
 pub use known_answer::KnownAnswer;

@@ -50,6 +50,15 @@ pub const ALL: [Board; 4] = [
     },
 ];
 
+/// A board's binaries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Program {
+    /// The product.
+    Drive,
+    /// Checks for bench and test.
+    Check,
+}
+
 /// What a run gave.
 #[derive(Clone, Debug)]
 pub struct Run {
@@ -60,13 +69,21 @@ pub struct Run {
 }
 
 impl Board {
-    /// Runs the board's program over an image; `None` where the program or the emulator is missing, which is said past
-    /// the test's capture.
+    /// Runs the self-test over an image; `None` as of [`Self::check`].
+    ///
+    /// # Panics
+    /// As [`Self::check`].
+    pub fn run(&self, image: &[u8]) -> Option<Run> {
+        self.check("self-test", image)
+    }
+
+    /// Runs a check over an image; `None` where the program or the emulator is missing, which is said past the test's
+    /// capture.
     ///
     /// # Panics
     /// The image cannot be written or the emulator not started.
-    pub fn run(&self, image: &[u8]) -> Option<Run> {
-        let program = self.program();
+    pub fn check(&self, check: &str, image: &[u8]) -> Option<Run> {
+        let program = self.program(Program::Check);
         if !program.exists() || !is_installed(self.emulator) {
             let _ = writeln!(
                 std::io::stderr(),
@@ -86,16 +103,21 @@ impl Board {
             .args(["-display", "none", "-monitor", "none", "-serial", "stdio", "-icount", "shift=6"])
             .args(["-semihosting-config", "enable=on,target=native", "-device"])
             .arg(format!("loader,file={},addr={:#x},force-raw=on", file.display(), self.image_address))
-            .arg("-kernel")
+            .args(["-append", check, "-kernel"])
             .arg(program)
             .output()
             .unwrap_or_else(|e| panic!("{}: {e}", self.emulator));
         Some(Run { status: output.status.code(), console: String::from_utf8_lossy(&output.stdout).into_owned() })
     }
 
-    fn program(&self) -> PathBuf {
+    /// Where `tests/run` puts the ELF of a program.
+    pub fn program(&self, program: Program) -> PathBuf {
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-        root.join("target/mcu").join(self.triple).join("release").join(self.name)
+        let name = match program {
+            Program::Drive => format!("{}-drive", self.name),
+            Program::Check => format!("{}-check", self.name),
+        };
+        root.join("target/mcu").join(self.triple).join("release").join(name)
     }
 }
 

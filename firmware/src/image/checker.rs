@@ -2,7 +2,7 @@
 
 use super::{Image, SectionKind};
 use core::fmt;
-use crc::{CRC_32_ISO_HDLC, Crc, Digest, Table};
+use crc::{CRC_32_ISO_HDLC, Crc, Table};
 
 static CRC: Crc<u32, Table<1>> = Crc::<u32, Table<1>>::new(&CRC_32_ISO_HDLC);
 
@@ -11,8 +11,11 @@ pub fn crc32(bytes: &[u8]) -> u32 {
     CRC.checksum(bytes)
 }
 
-/// The CRC-32 of bytes that come one after the other.
-pub(crate) fn crc32_digest() -> Digest<'static, u32, Table<1>> {
+/// [`crc32`] of bytes that come in parts.
+pub(crate) type Digest = crc::Digest<'static, u32, Table<1>>;
+
+/// Of no bytes yet.
+pub(crate) fn digest() -> Digest {
     CRC.digest()
 }
 
@@ -56,7 +59,7 @@ pub struct Checker<'a> {
     section: usize,
     /// Bytes of the current section that are read.
     position: usize,
-    digest: Digest<'static, u32, Table<1>>,
+    digest: Digest,
     checked: u32,
 }
 
@@ -69,7 +72,7 @@ impl fmt::Debug for Checker<'_> {
 impl<'a> Checker<'a> {
     /// Begins with the first section (the header's own CRC is checked by `parse`).
     pub fn new(image: &Image<'a>) -> Self {
-        Self { image: *image, section: 0, position: 0, digest: CRC.digest(), checked: 0 }
+        Self { image: *image, section: 0, position: 0, digest: digest(), checked: 0 }
     }
 
     /// Reads at most `max_bytes` more bytes (at least 1).
@@ -95,7 +98,7 @@ impl<'a> Checker<'a> {
     }
 
     fn finish_section(&mut self, section: SectionKind) -> Result<(), CheckError> {
-        let found = core::mem::replace(&mut self.digest, CRC.digest()).finalize();
+        let found = core::mem::replace(&mut self.digest, digest()).finalize();
         self.section = self.section.saturating_add(1);
         self.position = 0;
         let expected = self.image.section_crc(section);

@@ -1,8 +1,7 @@
 //! Packets: sequence number and message, CRC-32, COBS.
 
-use crate::image::{crc32, crc32_digest};
+use crate::image::{Digest, crc32, digest};
 use core::fmt;
-use crc::{Digest, Table};
 use heapless::Vec;
 use postcard::ser_flavors::{Cobs, Flavor, Slice};
 use postcard::serialize_with_flavor;
@@ -58,7 +57,7 @@ impl core::error::Error for Damage {}
 /// Appends the CRC of all bytes that pass.
 struct WithCrc<F> {
     inner: F,
-    crc: Digest<'static, u32, Table<1>>,
+    crc: Digest,
 }
 
 impl<F: Flavor> Flavor for WithCrc<F> {
@@ -81,7 +80,7 @@ impl<F: Flavor> Flavor for WithCrc<F> {
 /// The message is longer than a packet or than the buffer.
 pub fn encode<'b>(sequence: u16, message: &impl Serialize, buffer: &'b mut [u8]) -> Result<&'b mut [u8], TooLong> {
     let cobs = Cobs::try_new(Slice::new(buffer)).map_err(|_| TooLong)?;
-    let encoded = serialize_with_flavor(&(sequence, message), WithCrc { inner: cobs, crc: crc32_digest() });
+    let encoded = serialize_with_flavor(&(sequence, message), WithCrc { inner: cobs, crc: digest() });
     encoded.ok().filter(|encoded| encoded.len() <= MAX_ENCODED).ok_or(TooLong)
 }
 
