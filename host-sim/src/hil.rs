@@ -163,7 +163,9 @@ fn converse(
     let (mut session, introduction) = Session::open(&connection.line, image, options.tolerance, options.timeout)?;
     let mut run = Run::new(options, image, model, &introduction);
     match course {
-        Course::Frames { frames, folder, host } => run.frames(&frames, folder.as_deref(), host, &mut session, progress)?,
+        Course::Frames { frames, folder, host } => {
+            run.frames(&frames, folder.as_deref(), host, &mut session, progress)?
+        }
         Course::Log { log, decisions } => run.log(&log, &decisions, &mut session, progress)?,
     }
     if let Some(emulator) = &mut connection.emulator {
@@ -193,6 +195,7 @@ impl<'a> Course<'a> {
                 Ok(Self::Frames { frames, folder, host: Host::new(image, options.backend)? })
             }
             Feed::Log(folder) => {
+                system::of_image(&image)?;
                 let log = Log::read(folder)?;
                 let options = drive::Options {
                     image: options.image.clone(),
@@ -396,5 +399,6 @@ fn decision_of(answered: &Answered) -> Decision {
 
 fn changed(step: &str) -> Error {
     let message = "size of the images, or axes or height of the LiDAR, change within the log";
-    Error::new(ErrorCode::Frames, format!("step {step}"), message).with_help("a board is told its sensors once per drive")
+    Error::new(ErrorCode::Frames, format!("step {step}"), message)
+        .with_help("a board is told its sensors once per drive")
 }

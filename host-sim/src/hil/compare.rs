@@ -70,9 +70,9 @@ impl Reference<'_, '_> {
     fn outputs(&self, found: &[Vec<u8>]) -> Option<Unequal> {
         for (output, (found, expected)) in (0_u8..).zip(found.iter().zip(&self.expected.outputs)) {
             let port = self.image.output(output)?;
-            let writer = (0..self.image.step_count()).rev().find(|position| {
-                self.image.step(*position).is_some_and(|step| step.output() == port.tensor)
-            });
+            let writer = (0..self.image.step_count())
+                .rev()
+                .find(|position| self.image.step(*position).is_some_and(|step| step.output() == port.tensor));
             let writer = writer.map_or_else(String::new, |p| format!(" (step {p} {})", self.operator(p)));
             let place = format!("output `{}`{writer}", port.name);
             if found.len() != expected.len() {

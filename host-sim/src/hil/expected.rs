@@ -79,7 +79,8 @@ impl<'a> Host<'a> {
         let stopped = |fault| Output { controls: Controls::stop(Real::ZERO), status: Status::Fault(fault) };
         match (end, &self.profile) {
             (End::Infer(Some(inputs)), Some(profile)) => {
-                let output = answer.ok_or(Fault::NetworkFailed).and_then(|a| a.output().map_err(|_| Fault::NetworkFailed));
+                let output =
+                    answer.ok_or(Fault::NetworkFailed).and_then(|a| a.output().map_err(|_| Fault::NetworkFailed));
                 let controls = output.and_then(|output| profile.controls(output, Real::from(inputs.velocity)));
                 controls.map_or_else(stopped, |controls| Output { controls, status: Status::Driving })
             }

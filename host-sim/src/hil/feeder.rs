@@ -142,6 +142,11 @@ impl<'l> Feeder<'l> {
         }
     }
 
+    /// Whether a request belongs to the exchange under way, and not to one that was given up.
+    pub fn is_current(&self, request: u16) -> bool {
+        self.sent.iter().any(|(number, _)| *number == request)
+    }
+
     /// Forgets the requests of the exchange before.
     pub fn begin_exchange(&mut self) {
         self.sent.clear();
@@ -189,7 +194,9 @@ impl<'l> Feeder<'l> {
         let expected = self.expected.replace(sequence.wrapping_add(1)).unwrap_or(sequence);
         match sequence.wrapping_sub(expected) {
             0 => Ok(Packet(bytes)),
-            lost => Err(self.faulty(&format!("answers were lost on the line: packet {sequence} came {lost} too early"))),
+            lost => {
+                Err(self.faulty(&format!("answers were lost on the line: packet {sequence} came {lost} too early")))
+            }
         }
     }
 
@@ -216,7 +223,9 @@ fn remedy(reason: Refusal) -> &'static str {
         Refusal::Untested => "leave --no-self-test out",
         Refusal::SelfTestFailed { .. } => "the image in the board's memory is damaged, or its kernels are wrong",
         Refusal::Configuration => "the camera's image must not be smaller than the network's crop",
-        Refusal::NoSuchSensor | Refusal::InputsMissing => "--crop sends the network's inputs in place of the sensors' data",
+        Refusal::NoSuchSensor | Refusal::InputsMissing => {
+            "--crop sends the network's inputs in place of the sensors' data"
+        }
         Refusal::NoDriver => "only a driving network follows a log; --frames and --inputs run any network",
         Refusal::NoImage => "flash the image; firmware/boards/README.md says what fits which board",
         _ => "",

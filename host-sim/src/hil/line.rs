@@ -51,7 +51,11 @@ impl Shared {
 
 impl Line {
     /// A line over two streams. Reads that return from time to time (by a timeout of the stream) let it close in time.
-    pub fn new(name: impl Into<String>, reader: impl Read + Send + 'static, writer: impl Write + Send + 'static) -> Self {
+    pub fn new(
+        name: impl Into<String>,
+        reader: impl Read + Send + 'static,
+        writer: impl Write + Send + 'static,
+    ) -> Self {
         let shared = Arc::new(Shared::default());
         let (to_board, outgoing) = mpsc::channel();
         let (incoming, from_board) = mpsc::channel();
@@ -99,7 +103,8 @@ impl Line {
     }
 
     fn closed(&self) -> Error {
-        let message = self.shared.failure().map_or("the line was closed".into(), |why| format!("the line failed: {why}"));
+        let message =
+            self.shared.failure().map_or("the line was closed".into(), |why| format!("the line failed: {why}"));
         Error::new(ErrorCode::Link, &self.name, message).with_help("check power, cable and program of the board")
     }
 }

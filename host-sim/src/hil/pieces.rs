@@ -189,14 +189,16 @@ pub fn inputs(inputs: &[Vec<u8>]) -> Parcel {
         bytes: bytes.to_vec(),
     };
     let pieces = inputs.iter().enumerate();
-    let pieces = pieces.flat_map(|(input, bytes)| bytes.chunks(MAX_PIECE).enumerate().map(move |part| piece(input, part)));
+    let pieces =
+        pieces.flat_map(|(input, bytes)| bytes.chunks(MAX_PIECE).enumerate().map(move |part| piece(input, part)));
     Parcel { setup: Setup::default(), pieces: pieces.collect(), end: End::Infer(None) }
 }
 
 /// Speed, goal and command in the codes of the network's inputs. What the frame does not tell is zero, or to follow the
 /// lane.
 fn network_inputs(frame: &Frame, goal: [f64; 2]) -> NetworkInputs {
-    let codes = |kind, values: &[f64]| encode_input(kind, &values.iter().map(|&v| f64::from(v as f32)).collect::<Vec<_>>());
+    let codes =
+        |kind, values: &[f64]| encode_input(kind, &values.iter().map(|&v| f64::from(v as f32)).collect::<Vec<_>>());
     let goal = codes(InputKind::Goal, &goal);
     let velocity = codes(InputKind::Velocity, &[frame.speed.unwrap_or_default()]);
     NetworkInputs {
@@ -223,7 +225,8 @@ fn sides(image: &RgbImage, path: &Path) -> Result<[u16; 2]> {
 /// board then says what it lacks.
 fn cut(image: &RgbImage, view: View, crop: Shape, pieces: &mut Vec<Piece>) {
     let [width, height] = [image.width() as usize, image.height() as usize];
-    let span = |whole: usize, part: usize| whole.saturating_sub(part) / 2..(whole.saturating_sub(part) / 2 + part).min(whole);
+    let span =
+        |whole: usize, part: usize| whole.saturating_sub(part) / 2..(whole.saturating_sub(part) / 2 + part).min(whole);
     let (rows, columns) = (span(height, crop.height.into()), span(width, crop.width.into()));
     let row_bytes = columns.start * PIXEL_BYTES..columns.end * PIXEL_BYTES;
     for row in rows {
@@ -253,4 +256,76 @@ fn points(path: &Path, pieces: &mut Vec<Piece>) -> Result<()> {
     }
     pieces.extend(points.chunks(MAX_PIECE / POINT_BYTES * POINT_BYTES).map(|part| Piece::Points(part.to_vec())));
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_what_the_crop_needs_is_sent_in_whole_pixels() {
+        let image = RgbImage::from_fn(702, 9, |x, y| image::Rgb([x as u8, (x >> 8) as u8, y as u8]));
+        let mut pieces = Vec::new();
+        cut(&image, View::Left, Shape::map(4, 700, 10), &mut pieces);
+        // 700 pixels are 2100 bytes, from byte 3 on; rows 2 to 5 of 9.
+        let found = pieces.iter().map(|piece| match piece {
+            Piece::Row { view: View::Left, row, offset, bytes } => (*row, *offset, bytes.len(), bytes[2]),
+            other => panic!("{other:?}"),
+        });
+        let row = |row: u16| [(row, 3, 960, row as u8), (row, 963, 960, row as u8), (row, 1923, 180, row as u8)];
+        assert_eq!(found.collect::<Vec<_>>(), (2..6).flat_map(row).collect::<Vec<_>>());
+        pieces.clear();
+        cut(&image, View::Front, Shape::map(256, 1000, 3), &mut pieces);
+        assert_eq!(pieces.len(), 9 * 3, "of a smaller image all that there is");
+    }
+
+    #[test]
+    fn points_leave_their_intensity_behind_and_an_empty_sweep_is_told() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(LIDAR);
+        let sent = |count: u8| {
+            std::fs::write(&path, (0..count).flat_map(|point| [point; RECORD_BYTES]).collect::<Vec<_>>()).unwrap();
+            let mut pieces = Vec::new();
+            points(&path, &mut pieces).map(|()| pieces)
+        };
+        assert_eq!(sent(0).unwrap(), [Piece::Points(Vec::new())]);
+        let pieces = sent(100).unwrap();
+        assert_eq!(pieces.iter().map(Piece::name).collect::<Vec<_>>(), ["80 LiDAR points", "20 LiDAR points"]);
+        assert_eq!(pieces[1], Piece::Points((80..100).flat_map(|point| [point; POINT_BYTES]).collect()));
+        std::fs::write(&path, [0; 17]).unwrap();
+        assert!(points(&path, &mut Vec::new()).unwrap_err().message.contains("expected a multiple of 16"));
+    }
+
+    #[test]
+    fn inputs_go_piece_by_piece_from_their_beginning() {
+        let parcel = inputs(&[vec![1; 2000], vec![2; 3]]);
+        let sizes = parcel.pieces.iter().map(|piece| match piece {
+            Piece::Input { input, offset, bytes } => (*input, *offset, bytes.len()),
+            other => panic!("{other:?}"),
+        });
+        assert_eq!(sizes.collect::<Vec<_>>(), [(0, 0, 960), (0, 960, 960), (0, 1920, 80), (1, 0, 3)]);
+        assert_eq!(parcel.end, End::Infer(None));
+    }
+
+    #[test]
+    fn a_board_serves_what_it_was_set_up_for_and_what_says_nothing() {
+        let (small, large) = (Some([4, 3]), Some([40, 30]));
+        let lidar = Some((Axes::Velodyne, I16F16::lit("1.5")));
+        let setup = Setup { image: small, lidar };
+        assert!(
+            setup.serves(Setup::default()) && setup.serves(Setup { image: small, lidar: None }) && setup.is_whole()
+        );
+        assert!(!setup.serves(Setup { image: large, lidar: None }));
+        assert!(!Setup { image: small, lidar: None }.serves(setup));
+    }
+
+    #[test]
+    fn speed_goal_and_command_are_rounded_as_the_networks_inputs() {
+        let frame = Frame { speed: Some(1.001), command: Some(2), ..Frame::default() };
+        let inputs = network_inputs(&frame, [0.5, -20.0]);
+        assert_eq!((inputs.velocity.to_bits(), inputs.command), (256, Command::Right));
+        assert_eq!(inputs.goal.map(I16F16::to_bits), [32768, -1_310_720]);
+        let nothing = network_inputs(&Frame::default(), [0.0; 2]);
+        assert_eq!((nothing.velocity.to_bits(), nothing.command), (0, Command::LaneFollow));
+    }
 }

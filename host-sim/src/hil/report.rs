@@ -187,7 +187,8 @@ pub struct LinkFigures {
 
 impl From<LinkCounters> for LinkFigures {
     fn from(counters: LinkCounters) -> Self {
-        let LinkCounters { packets, damaged, lost, repeated, overflowed, incomplete_frames, abandoned_frames } = counters;
+        let LinkCounters { packets, damaged, lost, repeated, overflowed, incomplete_frames, abandoned_frames } =
+            counters;
         Self { packets, damaged, lost, repeated, overflowed, incomplete_frames, abandoned_frames }
     }
 }

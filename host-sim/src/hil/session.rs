@@ -174,9 +174,15 @@ impl<'l> Session<'l> {
                     let bytes_sent = self.feeder.take_bytes_sent();
                     return Ok(Answered { outputs, steps, telemetry, bytes_sent });
                 }
-                Response::Refused { request, reason } => return Err(self.feeder.refused(request, reason)),
-                // Of an earlier frame, for silence.
-                Response::Telemetry(_) | Response::Accepted { .. } | Response::Identity(_) => {}
+                Response::Refused { request, reason } if self.feeder.is_current(request) => {
+                    return Err(self.feeder.refused(request, reason));
+                }
+                // Of an earlier frame that was given up here, or stopped for silence: so is what came before it.
+                Response::Telemetry(_) => {
+                    outputs.iter_mut().for_each(Vec::clear);
+                    steps.clear();
+                }
+                Response::Refused { .. } | Response::Accepted { .. } | Response::Identity(_) => {}
             }
         }
     }

@@ -73,14 +73,21 @@ fn summary(report: &HilReport) -> String {
     if let Some(Spread { mean, min, max }) = summary.network {
         line("network", format!("{} {unit} on average, {min} to {max}", figure(Some(mean), 0)));
     }
-    line("start", format!("{} {unit} for the image's structure, {} for its bytes", report.board.parse, report.board.check));
+    line(
+        "start",
+        format!("{} {unit} for the image's structure, {} for its bytes", report.board.parse, report.board.check),
+    );
     line("known answers met", summary.self_tests.to_string());
     if let Some(bytes) = summary.stack_bytes {
         line("deepest stack", format!("{bytes} B"));
     }
-    let LinkFigures { packets, damaged, lost, repeated, overflowed, incomplete_frames, abandoned_frames } = summary.link;
+    let LinkFigures { packets, damaged, lost, repeated, overflowed, incomplete_frames, abandoned_frames } =
+        summary.link;
     line("packets to the board", format!("{packets}: {damaged} damaged, {lost} lost, {repeated} repeated"));
-    line("line", format!("{overflowed} B overflowed, {incomplete_frames} frames incomplete, {abandoned_frames} abandoned"));
+    line(
+        "line",
+        format!("{overflowed} B overflowed, {incomplete_frames} frames incomplete, {abandoned_frames} abandoned"),
+    );
     text
 }
 
