@@ -1,8 +1,8 @@
 //! The driving computer: frames come over the [link](crate::link), rows are cropped and points counted as they arrive,
 //! the network runs, the driver decides, the actuators are set, telemetry goes back.
 //!
-//! A board lends its line, clock and watchdog as a [`Board`], its outputs as an [`Actuate`], and memory; [`serve`] does
-//! the rest and returns where the program is to end. Nothing here waits for anyone: every loop ends by itself, with the
+//! A board lends its line, clock and watchdog as a [`Board`], its outputs as an [`Actuate`], and memory, as a
+//! [`Computer`]; [`Computer::run`] does the rest and returns where the program is to end. Nothing here waits for anyone: every loop ends by itself, with the
 //! budget of the network, or with the packet.
 //!
 //! # Safe state
@@ -31,21 +31,24 @@
 
 mod desk;
 mod line;
+mod log;
 mod network;
 mod rig;
 mod self_test;
+mod store;
 
 pub use line::Line;
 pub use rig::{CAMERA_WORDS, MAX_CAMERAS, Memory};
+pub use store::{ImageStore, NoStore};
 
 use crate::actuators::Actuate;
 use crate::drive::{Controls, Fault, Output, Real, Status};
 use crate::engine::{Engine, EngineError};
 use crate::image::{CheckError, CheckProgress, Checker, Image, ParseError};
 use crate::kernels::Kernels;
-use crate::link::{Configuration, Receiver, Refusal, Request, Response, decode};
+use crate::link::{Configuration, Receiver, Refusal, Request, decode};
 use core::fmt;
-use desk::Desk;
+use desk::{Desk, End, Lent};
 use rig::Rig;
 use self_test::SelfTest;
 
@@ -84,12 +87,14 @@ pub trait Board {
     }
 }
 
-/// Why [`serve`] returned.
+/// Why [`Computer::run`] returned.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Exit {
     /// The feeder asked the program to end.
     Halt,
+    /// The feeder asked the board to start anew, with [`crate::update::select`].
+    Restart,
 }
 
 /// Why an image cannot be run.
@@ -122,56 +127,73 @@ impl core::error::Error for StartError {}
 /// Bytes of an image that are checked between two calls of [`Board::feed_watchdog`].
 const CHECKED_AT_ONCE: usize = 4096;
 
-/// Runs the computer on an image until the feeder ends it. Begins in the safe state. An image that cannot be run leaves
-/// the vehicle there and every request refused ([`Refusal::NoImage`]).
-pub fn serve<B: Board, A: Actuate, K: Kernels + Copy>(
-    image: &[u8],
-    kernels: K,
-    arena: &mut [u8],
-    memory: &mut Memory,
-    line: &mut Line,
-    board: &mut B,
-    actuators: &mut A,
-) -> Exit {
-    stop(actuators);
-    let (image, times) = match start(image, board) {
-        Ok(started) => started,
-        Err(error) => return refuse_all(error, line, board),
-    };
-    let mut configuration = Configuration::default();
-    let mut test = SelfTest::new(image);
-    loop {
-        let rig = Rig::new(&image, &configuration, memory).or_else(|_| Rig::without_sensors(&image));
-        let engine = Engine::new(image, kernels, arena).map_err(StartError::Engine);
-        let (rig, engine) = match (rig, engine) {
-            (Ok(rig), Ok(engine)) => (rig, engine),
-            (Err(_), _) => return refuse_all(StartError::Sensors, line, board),
-            (_, Err(error)) => return refuse_all(error, line, board),
-        };
-        let Line { receiver, sender } = line;
-        let desk = Desk::new(configuration, times, engine, rig, &mut test, sender, board, actuators);
-        match converse(receiver, desk) {
-            desk::End::Configure(new) => configuration = new,
-            desk::End::Halt => return Exit::Halt,
-        }
+/// What a computer consists of.
+#[derive(Debug)]
+pub struct Computer<'a, B, A, K, S> {
+    /// The image, as memory-mapped flash holds it. One that cannot be run leaves the vehicle in the safe state and
+    /// every request refused ([`Refusal::NoImage`]), but for those that bring a new image.
+    pub image: &'a [u8],
+    /// Backend of the core.
+    pub kernels: K,
+    /// Memory of the engine.
+    pub arena: &'a mut [u8],
+    /// Memory of the sensors.
+    pub memory: &'a mut Memory,
+    /// State of the line.
+    pub line: &'a mut Line,
+    /// Line, clock, watchdog.
+    pub board: &'a mut B,
+    /// What moves the vehicle.
+    pub actuators: &'a mut A,
+    /// Where a new image goes; [`NoStore`] where there is no room for one.
+    pub store: &'a mut S,
+}
+
+impl<B: Board, A: Actuate, K: Kernels + Copy, S: ImageStore> Computer<'_, B, A, K, S> {
+    /// Runs until the feeder ends it. Begins in the safe state.
+    pub fn run(self) -> Exit {
+        let Self { image, kernels, arena, memory, line, board, actuators, store } = self;
         stop(actuators);
+        let (image, times) = match start(image, board) {
+            Ok(started) => started,
+            Err(error) => return refuse_all(error, line, board, store),
+        };
+        let mut configuration = Configuration::default();
+        let mut test = SelfTest::new(image);
+        loop {
+            let rig = Rig::new(&image, &configuration, memory).or_else(|_| Rig::without_sensors(&image));
+            let engine = Engine::new(image, kernels, arena).map_err(StartError::Engine);
+            let (rig, engine) = match (rig, engine) {
+                (Ok(rig), Ok(engine)) => (rig, engine),
+                (Err(_), _) => return refuse_all(StartError::Sensors, line, board, store),
+                (_, Err(error)) => return refuse_all(error, line, board, store),
+            };
+            let Line { receiver, sender } = line;
+            let lent = Lent { sender, board, actuators, store, test: &mut test };
+            match converse(receiver, Desk::new(configuration, times, engine, rig, lent)) {
+                End::Configure(new) => configuration = new,
+                End::Exit(exit) => return exit,
+            }
+            stop(actuators);
+        }
     }
 }
 
 /// Carries out one request after the other until the drive is over.
-fn converse<B: Board, A: Actuate, K: Kernels>(
+fn converse<B: Board, A: Actuate, K: Kernels, S: ImageStore>(
     receiver: &mut Receiver,
-    mut desk: Desk<'_, '_, '_, B, A, K>,
-) -> desk::End {
+    mut desk: Desk<'_, '_, '_, B, A, K, S>,
+) -> End {
     loop {
-        desk.board.feed_watchdog();
-        let Some(byte) = desk.sender.next_byte(desk.board) else {
+        let Lent { sender, board, .. } = &mut desk.lent;
+        board.feed_watchdog();
+        let Some(byte) = sender.next_byte(*board) else {
             desk.idle();
             continue;
         };
         match receiver.push(byte) {
             None => {}
-            Some(Err(_)) => desk.sender.count_damaged(),
+            Some(Err(_)) => desk.lent.sender.count_damaged(),
             Some(Ok(packet)) => {
                 if let Some(end) = desk.handle(packet) {
                     return end;
@@ -198,7 +220,7 @@ fn start<'i, B: Board>(image: &'i [u8], board: &mut B) -> Result<(Image<'i>, Sta
         board.feed_watchdog();
     }
     let times = StartTimes { parse: parsed.wrapping_sub(begin), check: board.ticks().wrapping_sub(parsed) };
-    log_start(board, &image, times);
+    log::started(board.name(), &image, times);
     Ok((image, times))
 }
 
@@ -209,9 +231,9 @@ fn stop<A: Actuate>(actuators: &mut A) {
     let _ = actuators.apply(&output);
 }
 
-/// Without an image there is only one answer.
-fn refuse_all<B: Board>(error: StartError, line: &mut Line, board: &mut B) -> Exit {
-    log_error(board, error);
+/// Without an image there is only one answer, but to what brings one.
+fn refuse_all<B: Board, S: ImageStore>(error: StartError, line: &mut Line, board: &mut B, store: &mut S) -> Exit {
+    log::no_image(board.name(), error);
     let Line { receiver, sender } = line;
     loop {
         board.feed_watchdog();
@@ -221,26 +243,16 @@ fn refuse_all<B: Board>(error: StartError, line: &mut Line, board: &mut B) -> Ex
         };
         let Some(Ok(packet)) = receiver.push(byte) else { continue };
         let Ok((request, message)) = decode::<Request<'_>>(packet) else { continue };
-        if message == Request::Halt && board.can_halt() {
-            return Exit::Halt;
+        let exit = match message {
+            Request::Halt if board.can_halt() => Some(Exit::Halt),
+            Request::Restart => Some(Exit::Restart),
+            _ => None,
+        };
+        let stored = store::carry_out(store, &message, board, B::feed_watchdog);
+        let outcome = if exit.is_some() { Ok(()) } else { stored.unwrap_or(Err(Refusal::NoImage)) };
+        sender.answer(board, request, outcome);
+        if let Some(exit) = exit {
+            return exit;
         }
-        sender.send(board, &Response::Refused { request, reason: Refusal::NoImage });
     }
 }
-
-#[cfg(feature = "defmt")]
-fn log_start<B: Board>(board: &B, image: &Image<'_>, times: StartTimes) {
-    defmt::info!("{=str}: image {=str}, {=usize} bytes", board.name(), image.name(), image.bytes().len());
-    defmt::info!("parse {=u64} ticks, check {=u64} ticks", times.parse, times.check);
-}
-
-#[cfg(not(feature = "defmt"))]
-fn log_start<B: Board>(_: &B, _: &Image<'_>, _: StartTimes) {}
-
-#[cfg(feature = "defmt")]
-fn log_error<B: Board>(board: &B, error: StartError) {
-    defmt::error!("{=str}: no image: {}", board.name(), error);
-}
-
-#[cfg(not(feature = "defmt"))]
-fn log_error<B: Board>(_: &B, _: StartError) {}

@@ -7,7 +7,7 @@
 //!
 //! | part | content | covered by |
 //! |---|---|---|
-//! | header, 384 bytes | magic, format, counts, features, name, digests, regions, section table | header CRC |
+//! | header, 384 bytes | magic, format, counts, features, name, target, revision, digests, regions, sections | header CRC |
 //! | ports | inputs, then outputs: tensor, zero point, scale (metadata), name; 32 bytes each | section CRC |
 //! | tensors | 32-byte records `{region, type, offset, bytes, dims, first_step, last_step, in_place_of}` | section CRC |
 //! | step index | first byte of every step in the program, `u32` each | section CRC |
@@ -69,6 +69,7 @@ pub mod layout;
 mod parse;
 mod records;
 
+pub(crate) use checker::Cursor;
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
 pub(crate) use checker::{Digest, digest};
 pub use checks::{Check, ParseError, Place};
@@ -127,6 +128,15 @@ struct Section {
     crc: u32,
 }
 
+impl Section {
+    /// The section's bytes in the file, with its padding.
+    fn padded(self, file: &[u8]) -> &[u8] {
+        let start = index(self.offset);
+        let end = start.saturating_add(index(self.length)).checked_next_multiple_of(layout::ALIGNMENT);
+        end.and_then(|end| file.get(start..end)).unwrap_or_default()
+    }
+}
+
 /// A parsed image: a view of the caller's bytes and a proof that [`Image::parse`] accepted them.
 #[derive(Clone, Copy, Debug)]
 pub struct Image<'a> {
@@ -180,6 +190,21 @@ impl<'a> Image<'a> {
 
     fn digest(&self, at: core::ops::Range<usize>) -> [u8; 32] {
         self.bytes.get(at).and_then(|field| field.try_into().ok()).unwrap_or_default()
+    }
+
+    /// Name of the target that the image was compiled for, empty where unknown.
+    pub fn target(&self) -> &'a str {
+        self.bytes.get(layout::header::TARGET).and_then(text).unwrap_or_default()
+    }
+
+    /// Revision of the model: what an update compares.
+    pub fn revision(&self) -> u32 {
+        bytes::u32_at(self.bytes, layout::header::REVISION).unwrap_or_default()
+    }
+
+    /// CRC-32 of the header. As the header holds the CRCs of all sections, it tells images apart.
+    pub fn header_crc(&self) -> u32 {
+        bytes::u32_at(self.bytes, layout::header::CRC).unwrap_or_default()
     }
 
     /// Union of the feature bits of all steps and kernels.
@@ -308,10 +333,7 @@ impl<'a> Image<'a> {
 
     /// The bytes of a section with its padding.
     fn padded_section(&self, kind: SectionKind) -> &'a [u8] {
-        let Section { offset, length, .. } = self.slot(kind);
-        let start = index(offset);
-        let end = start.saturating_add(index(length)).checked_next_multiple_of(layout::ALIGNMENT);
-        end.and_then(|end| self.bytes.get(start..end)).unwrap_or_default()
+        self.slot(kind).padded(self.bytes)
     }
 
     /// CRC-32 that the header records for a section.

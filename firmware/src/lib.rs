@@ -33,6 +33,7 @@
 //! * [`kernels`]: one method per operator; [`kernels::portable`] is the norm, other backends equal it byte for byte.
 //!   [`kernels::plan`] tells compiler and runtime what a kernel needs. Under the feature `conformance` a sweep proves it.
 //! * [`image`] and [`program`]: the file format, its checks, and the steps. The compiler writes what these define.
+//! * [`update`]: a new image in the field: two slots of a flash, and the start that chooses between them.
 //! * [`sensors`]: camera rows, LiDAR points, speed and goal as the network reads them.
 //! * [`waypoint`]: the network's result as a controller reads it.
 //! * [`tensor`] and [`fixed_point`]: shapes, types and the one arithmetic.
@@ -73,4 +74,5 @@ pub mod ops;
 pub mod program;
 pub mod sensors;
 pub mod tensor;
+pub mod update;
 pub mod waypoint;

@@ -18,6 +18,8 @@
 //! Route (node) …                      ──►  Accepted …
 //! SelfTest                            ──►  Accepted (the known answer, every step)
 //! Begin, Row…, Points…, End           ──►  Step… and Output… where asked for, Telemetry
+//! Announce, Piece…, Install           ──►  Accepted, … (a new image, see crate::update)
+//! Restart                             ──►  Accepted; Identify again
 //! ```
 //!
 //! # What the line must carry
@@ -57,7 +59,7 @@ mod response;
 
 pub use packet::{Damage, MAX_ENCODED, MAX_PACKET, Receiver, TooLong, decode, encode};
 pub use request::{CameraSetup, Configuration, Detail, End, Request};
-pub use response::{Answer, Identity, LinkCounters, Refusal, Response, StepReport, Telemetry};
+pub use response::{Answer, Identity, LinkCounters, Refusal, Response, StepReport, Telemetry, UpdateRefusal};
 
 /// Version of the messages; boards and feeders of different versions do not talk.
 pub const PROTOCOL: u16 = 1;

@@ -39,6 +39,7 @@ pub mod demo;
 pub mod diff;
 pub mod drive;
 pub mod files;
+pub mod footprint;
 pub mod gates;
 pub mod hil;
 pub mod histogram;

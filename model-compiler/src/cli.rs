@@ -59,6 +59,9 @@ enum Command {
         quantize: QuantizeArgs,
         #[command(flatten)]
         target: TargetArgs,
+        /// Revision of the model: an update in the field refuses a lower one than it runs.
+        #[arg(long, default_value_t = 0, value_name = "N")]
+        revision: u32,
         /// Output file; the record gets the same name with the extension .record.
         #[arg(short, long, value_name = "OUT.img")]
         output: PathBuf,
@@ -315,8 +318,8 @@ impl Command {
     fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<String> {
         match self {
             Self::Quantize { model, quantize, output } => run_quantize(model, quantize, output, bar),
-            Self::Compile { model, quantize, target, output } => {
-                run_compile(model, quantize, target, output, bar, console)
+            Self::Compile { model, quantize, target, revision, output } => {
+                run_compile(model, quantize, target, *revision, output, bar, console)
             }
             Self::Inspect { file } => inspect::inspect(file),
             Self::Completions(shell) => Ok(shell.script::<Cli>()),
@@ -340,6 +343,7 @@ fn run_compile(
     model: &Path,
     quantize: &QuantizeArgs,
     target: &TargetArgs,
+    revision: u32,
     output: &Path,
     bar: &mut Bar,
     console: &mut Console<'_>,
@@ -362,7 +366,7 @@ fn run_compile(
     };
     let options = target.plan_options(&target_data);
     let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t));
-    let compiled = compiled.map_err(|e| e.within(model.display()))?;
+    let compiled = compiled.and_then(|c| c.with_revision(revision)).map_err(|e| e.within(model.display()))?;
     pipeline::write(&compiled, output)?;
     let mut text = String::new();
     for (key, value) in pipeline::summary(&compiled) {

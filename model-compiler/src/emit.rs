@@ -29,6 +29,10 @@ pub struct ImageParts {
     pub arena_bytes: u32,
     /// Alignment of the arena: a power of two, 16..=4096.
     pub arena_alignment: u32,
+    /// Target that the image is compiled for, at most 16 bytes of visible ASCII; empty where unknown.
+    pub target: String,
+    /// Revision of the model: what an update compares.
+    pub revision: u32,
     /// SHA-256 of the quantized model; zeros where unknown.
     pub qmodel_digest: [u8; 32],
     /// Digest that names the build; zeros where unknown.
@@ -189,6 +193,18 @@ pub fn with_known_answer(image: &[u8], known_answer: Option<&KnownAnswer>) -> Re
     Ok(bytes)
 }
 
+/// The same image with another revision.
+///
+/// # Errors
+/// `Malformed` where `image` is no image.
+pub fn with_revision(image: &[u8], revision: u32) -> Result<Vec<u8>> {
+    let mut aligned = AlignedBytes::from(image);
+    Image::parse(&aligned).map_err(|error| malformed("image", error.to_string()))?;
+    aligned[header::REVISION].copy_from_slice(&revision.to_le_bytes());
+    reseal(&mut aligned);
+    Ok(aligned.to_vec())
+}
+
 /// Recomputes the CRCs of all sections and of the header of an image that was changed by hand. Sections that do not
 /// lie in the file keep their CRC; a file shorter than a header is left alone.
 pub fn reseal(image: &mut [u8]) {
@@ -226,6 +242,11 @@ fn write_header(bytes: &mut [u8], parts: &ImageParts) -> Result<()> {
     let name = bytes[header::NAME].get_mut(..parts.name.len());
     name.ok_or_else(|| malformed(&parts.name, "the model name is longer than 32 bytes"))?
         .copy_from_slice(parts.name.as_bytes());
+    let target = bytes[header::TARGET].get_mut(..parts.target.len());
+    target
+        .ok_or_else(|| malformed(&parts.target, "the target name is longer than 16 bytes"))?
+        .copy_from_slice(parts.target.as_bytes());
+    bytes[header::REVISION].copy_from_slice(&parts.revision.to_le_bytes());
     bytes[header::QMODEL_DIGEST].copy_from_slice(&parts.qmodel_digest);
     bytes[header::BUILD_DIGEST].copy_from_slice(&parts.build_digest);
     bytes[at(region::NAME)].copy_from_slice(&region::MAIN);

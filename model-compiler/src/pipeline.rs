@@ -2,7 +2,7 @@
 
 use crate::artifact::{self, hex};
 use crate::calibrate::calibrate;
-use crate::emit::emit;
+use crate::emit::{self, emit};
 use crate::error::{Error, ErrorCode, Result};
 use crate::frames::{self, Frame, FrameFormat};
 use crate::import::{self, ImportOptions};
@@ -85,6 +85,18 @@ pub struct Compiled {
     pub record: Record,
 }
 
+impl Compiled {
+    /// The same with another revision of the model; a fresh image has revision 0.
+    ///
+    /// # Errors
+    /// The image is none.
+    pub fn with_revision(mut self, revision: u32) -> Result<Self> {
+        self.image = emit::with_revision(&self.image, revision)?;
+        self.record.image_sha256 = artifact::sha256(&self.image);
+        Ok(self)
+    }
+}
+
 /// Plans, packs and emits a quantized model for a target.
 ///
 /// # Errors
@@ -98,6 +110,7 @@ pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress:
     })?;
     progress("plan", 1, 1);
     let mut parts = pack(model, &plan)?;
+    parts.target = target.name.clone();
     parts.known_answer = Some(known_answer(model, &plan, |done, total| progress("known answer", done, total))?);
     progress("emit", 0, 1);
     let image = emit(&parts)?;

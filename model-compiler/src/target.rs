@@ -3,7 +3,7 @@
 //! Built in are families without sizes; `--ram` and `--flash` or a TOML file add them:
 //!
 //! ```toml
-//! name = "my-board"
+//! name = "my-board"        # at most 16 visible ASCII characters; the image carries it
 //! alignment = 4            # of tensors, bytes; a power of two
 //! flash = "2M"             # bytes, or with K or M (1024, 1024²); absent: unlimited
 //! kernels = ["direct"]     # or "k4n16": what the runtime there has, the best first; absent: direct
@@ -16,6 +16,7 @@
 use crate::error::{Error, ErrorCode, Result};
 use crate::memory_plan::{MemoryPlan, PlanStatus};
 use crate::qmodel::QModel;
+use firmware::image::layout::header;
 use firmware::kernels::plan;
 use firmware::program::KernelId;
 use serde::Deserialize;
@@ -95,6 +96,12 @@ impl Target {
             Error::new(ErrorCode::Malformed, "", e.to_string().trim_end())
                 .with_help("fields: name, alignment, flash, kernels, [[regions]] with name and bytes")
         })?;
+        let is_plain = file.name.bytes().all(|byte| byte.is_ascii_graphic());
+        if !is_plain || !(1..=header::TARGET.len()).contains(&file.name.len()) {
+            let message =
+                format!("found '{}', expected 1 to {} visible ASCII characters", file.name, header::TARGET.len());
+            return Err(Error::new(ErrorCode::Malformed, "name", message));
+        }
         if !file.alignment.is_power_of_two() || !(4..=4096).contains(&file.alignment) {
             let message = format!("found {}, expected a power of two from 4 to 4096", file.alignment);
             return Err(Error::new(ErrorCode::Malformed, "alignment", message));
@@ -314,6 +321,9 @@ mod tests {
     fn refuses_descriptions_with_a_reason() {
         let cases = [
             (BOARD.replace("flash", "falsh"), "falsh"),
+            (BOARD.replace("'b'", "''"), "name"),
+            (BOARD.replace("'b'", "'a board'"), "'a board'"),
+            (BOARD.replace("'b'", "'a-name-too-long-x'"), "1 to 16"),
             (BOARD.replace("= 16", "= 12"), "alignment"),
             (BOARD.replace("'2M'", "'2X'"), "flash"),
             (BOARD.replace("1000", "-5"), "bytes"),

@@ -11,6 +11,7 @@ use firmware::program::{Clamp, ConstRange, KernelId, Requant, Requantize, Step};
 use firmware::tensor::{ElementType, Shape, TensorId};
 use model_compiler::emit::{
     AlignedBytes, ConstantsBuilder, ImageParts, ImagePort, KnownAnswer, assemble, emit, reseal, with_known_answer,
+    with_revision,
 };
 use sample_image::{STEPS, at, ids};
 
@@ -39,6 +40,7 @@ fn sample_is_accepted() {
     assert_eq!(image.name(), parts.name);
     assert_eq!(image.qmodel_digest(), parts.qmodel_digest);
     assert_eq!(image.build_digest(), parts.build_digest);
+    assert_eq!((image.target(), image.revision()), (parts.target.as_str(), parts.revision));
     assert_eq!((image.step_count() as usize, image.tensor_count() as usize), (STEPS, parts.tensors.len()));
     for (position, step) in parts.steps.iter().enumerate() {
         assert_eq!(image.step(position as u16).as_ref(), Some(step));
@@ -478,9 +480,20 @@ fn parts_that_do_not_fit_are_refused_by_name() {
     parts.inputs[1].name = "n".repeat(25);
     assert!(assemble(&parts).expect_err("port").message.contains("24 bytes"));
     parts = sample_image::parts();
+    parts.target = "t".repeat(17);
+    assert!(assemble(&parts).expect_err("target").message.contains("16 bytes"));
+    parts = sample_image::parts();
     parts.arena_bytes -= 16;
     let error = emit(&parts).expect_err("arena");
     assert!(error.message.contains("outside the arena"), "{error}");
+}
+
+#[test]
+fn another_revision_changes_nothing_else() {
+    let old = emit(&sample_image::parts()).expect("valid");
+    let new = with_revision(&old, 4).expect("an image");
+    assert_eq!(new, emit(&ImageParts { revision: 4, ..sample_image::parts() }).expect("valid"));
+    assert!(with_revision(&old[..64], 4).is_err());
 }
 
 /// The image of the format page.
@@ -511,6 +524,8 @@ fn page_example() -> ImageParts {
         outputs: vec![port("y", 1)],
         arena_bytes: 32,
         arena_alignment: 16,
+        target: String::new(),
+        revision: 0,
         qmodel_digest: [0; 32],
         build_digest: [0; 32],
         known_answer: None,

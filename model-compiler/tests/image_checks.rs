@@ -83,6 +83,7 @@ fn header_changes() -> Vec<(Check, Change)> {
         (Check::HeaderCrc, Raw(|b| b[header::NAME.start] ^= 1)),
         (Check::TotalBytes, Raw(|b| b.extend([0; 16]))),
         (Check::HeaderReserved, Sealed(|b| b[header::RESERVED_A.start] = 1)),
+        (Check::HeaderReserved, Sealed(|b| b[header::RESERVED_B.start] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::RESERVED_B.end - 1] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::REGIONS.end - 1] = 1)),
         (Check::HeaderReserved, Sealed(|b| b[header::SECTIONS.end - 1] = 1)),
@@ -104,6 +105,10 @@ fn header_changes() -> Vec<(Check, Change)> {
         (Check::RegionAlignment, Parts(|p| p.arena_alignment = 8192)),
         (Check::ModelName, Sealed(|b| b[header::NAME.start] = 0xFF)),
         (Check::ModelName, Sealed(|b| b[header::NAME.end - 1] = b'x')),
+        (Check::TargetName, Sealed(|b| b[header::TARGET.start] = 0xFF)),
+        (Check::TargetName, Sealed(|b| b[header::TARGET.start] = b' ')),
+        (Check::TargetName, Sealed(|b| b[header::TARGET.start] = 0)),
+        (Check::TargetName, Sealed(|b| b[header::TARGET.end - 1] = b'x')),
     ]
 }
 

@@ -16,6 +16,8 @@ pub struct Board {
     machine: &'static [&'static str],
     /// Where the program looks for the image.
     image_address: u32,
+    /// By how much two equal counts of instructions may differ: the counter's tick may be no divisor of 64 ns.
+    pub counter_resolution: u64,
 }
 
 /// Every board.
@@ -26,6 +28,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps2-an386"],
         image_address: 0x2100_0000,
+        counter_resolution: 1,
     },
     Board {
         name: "an500",
@@ -33,6 +36,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps2-an500"],
         image_address: 0x6000_0000,
+        counter_resolution: 1,
     },
     Board {
         name: "an547",
@@ -40,6 +44,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps3-an547"],
         image_address: 0x6000_0000,
+        counter_resolution: 0,
     },
     Board {
         name: "virt",
@@ -47,6 +52,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-aarch64",
         machine: &["virt", "-cpu", "cortex-a72", "-m", "512M", "-nic", "none"],
         image_address: 0x5000_0000,
+        counter_resolution: 0,
     },
 ];
 
@@ -77,12 +83,12 @@ impl Board {
         self.check("self-test", image)
     }
 
-    /// Runs a check over an image; `None` where the program or the emulator is missing, which is said past the test's
+    /// Runs a check over an image and what lies behind it; `None` where the program or the emulator is missing, which is said past the test's
     /// capture.
     ///
     /// # Panics
     /// The image cannot be written or the emulator not started.
-    pub fn check(&self, check: &str, image: &[u8]) -> Option<Run> {
+    pub fn check(&self, check: &str, memory: &[u8]) -> Option<Run> {
         let program = self.program(Program::Check);
         if !program.exists() || !is_installed(self.emulator) {
             let _ = writeln!(
@@ -96,7 +102,7 @@ impl Board {
         }
         let folder = tempfile::tempdir().expect("a temporary folder");
         let file = folder.path().join("model.img");
-        fs::write(&file, image).expect("the image");
+        fs::write(&file, memory).expect("the image");
         let output = Command::new(self.emulator)
             .arg("-M")
             .args(self.machine)

@@ -96,6 +96,9 @@ fn visit_header(image: &[u8], visit: VisitOwned<'_>) {
         ("arena alignment".to_owned(), in_slot(header::REGIONS.start, region::ALIGNMENT)),
         ("second region".to_owned(), header::REGIONS.end - 4..header::REGIONS.end),
         ("last section".to_owned(), header::SECTIONS.end - 4..header::SECTIONS.end),
+        ("target".to_owned(), header::TARGET.start..header::TARGET.start + 1),
+        ("target end".to_owned(), header::TARGET.end - 1..header::TARGET.end),
+        ("revision".to_owned(), header::REVISION),
         ("reserved B".to_owned(), header::RESERVED_B.start..header::RESERVED_B.start + 4),
     ];
     for kind in SectionKind::ALL {

@@ -1,7 +1,7 @@
 //! The driving computer behind a pseudo-terminal: a board for `host-sim hil --port`, in a thread of the test.
 
 use firmware::actuators::{Actuate, ActuatorFault, Duties};
-use firmware::computer::{self, Line, Memory, serve};
+use firmware::computer::{self, Computer, Line, Memory, NoStore};
 use firmware::drive::Output;
 use firmware::image::Image;
 use firmware::kernels::Portable;
@@ -66,8 +66,17 @@ impl SerialBoard {
                 is_ending: ending,
                 has_ended: false,
             };
-            let (memory, line) = (&mut Memory::new(), &mut Line::new());
-            serve(&image, Portable, arena.poisoned(0), memory, line, &mut board, &mut Outputs);
+            let computer = Computer {
+                image: &image,
+                kernels: Portable,
+                arena: arena.poisoned(0),
+                memory: &mut Memory::new(),
+                line: &mut Line::new(),
+                board: &mut board,
+                actuators: &mut Outputs,
+                store: &mut NoStore,
+            };
+            computer.run();
         });
         Self { device, _slave: kept, is_ending, thread: Some(thread) }
     }

@@ -1,10 +1,12 @@
 //! Where requests are carried out.
 
 use super::line::{Order, Sender};
+use super::log;
 use super::network::{Network, network_output};
 use super::rig::{Rig, Sensed};
 use super::self_test::SelfTest;
-use super::{Board, StartTimes};
+use super::store::{self, ImageStore};
+use super::{Board, Exit, StartTimes};
 use crate::actuators::Actuate;
 use crate::drive::{Controls, Driver, Fault, Measurements, NetworkError, NetworkInputs, Output, Reading, Real};
 use crate::drive::{Status, Step};
@@ -21,7 +23,7 @@ const MAX_SKIPPED: u32 = 64;
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum End {
     Configure(Configuration),
-    Halt,
+    Exit(Exit),
 }
 
 /// A frame under way.
@@ -35,18 +37,24 @@ struct Frame {
     is_refused: bool,
 }
 
-/// All that a drive consists of.
-pub(super) struct Desk<'i, 'a, 'm, B, A, K> {
+/// What outlives a drive.
+pub(super) struct Lent<'i, 'm, B, A, S> {
     pub sender: &'m mut Sender,
     pub board: &'m mut B,
-    actuators: &'m mut A,
+    pub actuators: &'m mut A,
+    pub store: &'m mut S,
+    pub test: &'m mut SelfTest<'i>,
+}
+
+/// All that a drive consists of.
+pub(super) struct Desk<'i, 'a, 'm, B, A, K, S> {
+    pub lent: Lent<'i, 'm, B, A, S>,
     engine: Engine<'a, K>,
     rig: Rig<'m>,
     network: Option<Network>,
     driver: Driver,
     configuration: Configuration,
     times: StartTimes,
-    test: &'m mut SelfTest<'i>,
     frame: Option<Frame>,
     last_frame: Option<u32>,
     /// When the last frame of a drive ended, or the vehicle was last stopped for silence.
@@ -55,33 +63,26 @@ pub(super) struct Desk<'i, 'a, 'm, B, A, K> {
     is_refused: bool,
 }
 
-impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
+impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels, S: ImageStore> Desk<'i, 'a, 'm, B, A, K, S> {
     /// A drive before its first frame.
-    #[expect(clippy::too_many_arguments, reason = "one place makes it, of all that there is")]
     pub fn new(
         configuration: Configuration,
         times: StartTimes,
         engine: Engine<'a, K>,
         rig: Rig<'m>,
-        test: &'m mut SelfTest<'i>,
-        sender: &'m mut Sender,
-        board: &'m mut B,
-        actuators: &'m mut A,
+        lent: Lent<'i, 'm, B, A, S>,
     ) -> Self {
         let network = Network::of_image(engine.image());
         // An image that drives nothing is never driven.
         let profile = network.map_or(crate::drive::System::TransFuser.profile(), |network| network.profile);
         Self {
-            sender,
-            board,
-            actuators,
+            lent,
             engine,
             rig,
             network,
             driver: Driver::new(profile),
             configuration,
             times,
-            test,
             frame: None,
             last_frame: None,
             last_end: None,
@@ -92,16 +93,24 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
     /// Nothing was received: watches the silence, tests a slice.
     pub fn idle(&mut self) {
         self.watch_silence();
-        let is_wanted =
-            self.configuration.tests_in_background || (self.configuration.needs_self_test && self.test.passed() == 0);
+        let is_wanted = self.configuration.tests_in_background
+            || (self.configuration.needs_self_test && self.lent.test.passed() == 0);
         // The arena holds the inputs of a frame under way.
-        if self.frame.is_some() || !is_wanted || self.test.failure().is_some() {
-            self.board.wait();
+        if self.frame.is_some() || !is_wanted || self.lent.test.failure().is_some() {
+            self.lent.board.wait();
             return;
         }
-        if self.test.advance(&mut self.engine).is_err() && self.last_end.is_some() {
-            let output = self.driver.halt(Fault::NetworkFailed);
-            self.finish(self.last_frame.unwrap_or(0), output, Answer::None, 0);
+        match self.lent.test.advance(&mut self.engine) {
+            Ok(false) => {}
+            // Where that fails, the image stays on trial, and the next round tries again.
+            Ok(true) => drop(self.lent.store.confirm()),
+            Err(reason) => {
+                log::self_test_failed(reason);
+                if self.last_end.is_some() {
+                    let output = self.driver.halt(Fault::NetworkFailed);
+                    self.finish(self.last_frame.unwrap_or(0), output, Answer::None, 0);
+                }
+            }
         }
     }
 
@@ -110,11 +119,11 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
         let (sequence, request) = match link::decode::<Request<'_>>(packet) {
             Ok(decoded) => decoded,
             Err(_) => {
-                self.sender.count_damaged();
+                self.lent.sender.count_damaged();
                 return None;
             }
         };
-        match self.sender.note(sequence, request == Request::Identify) {
+        match self.lent.sender.note(sequence, request == Request::Identify) {
             Order::Next => {}
             Order::AfterLoss => {
                 if let Some(frame) = &mut self.frame {
@@ -134,11 +143,23 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
             }),
             Request::SelfTest => self.self_test(),
             Request::Route(node) => self.driver.route().push(node).map_err(|_| Refusal::RouteFull),
-            Request::Halt if self.board.can_halt() => {
-                end = Some(End::Halt);
+            Request::Restart => {
+                end = Some(End::Exit(Exit::Restart));
+                Ok(())
+            }
+            Request::Halt if self.lent.board.can_halt() => {
+                end = Some(End::Exit(Exit::Halt));
                 Ok(())
             }
             Request::Halt => Err(Refusal::NoHalt),
+            Request::Announce(_) | Request::Piece { .. } | Request::Install => {
+                let Lent { sender, board, store, .. } = &mut self.lent;
+                let between = |board: &mut B| {
+                    board.feed_watchdog();
+                    sender.take_in(board);
+                };
+                store::carry_out(*store, &request, *board, between).unwrap_or(Ok(()))
+            }
             Request::Begin { frame, detail } => return self.silently(sequence, |desk| desk.begin(frame, detail)),
             Request::Row { view, row, offset, bytes } => {
                 return self
@@ -159,15 +180,12 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
                 return None;
             }
         };
-        match outcome {
-            Ok(()) => self.sender.send(self.board, &Response::Accepted { request: sequence }),
-            Err(reason) => self.refuse(sequence, reason),
-        }
+        self.lent.sender.answer(self.lent.board, sequence, outcome);
         end
     }
 
     fn refuse(&mut self, request: u16, reason: Refusal) {
-        self.sender.send(self.board, &Response::Refused { request, reason });
+        self.lent.sender.answer(self.lent.board, request, Err(reason));
     }
 
     /// Carries out what is not answered, but for its first refusal.
@@ -185,8 +203,6 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
     fn identify(&mut self) {
         let image = *self.engine.image();
         let bytes = image.bytes();
-        // Without the CRC itself: over bytes and their CRC, every CRC is the same.
-        let header = bytes.get(..crate::image::layout::header::CRC.start).unwrap_or(bytes);
         let identity = |board| Identity {
             protocol: PROTOCOL,
             board,
@@ -194,41 +210,43 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
             qmodel_digest: image.qmodel_digest(),
             build_digest: image.build_digest(),
             image_bytes: u32::try_from(bytes.len()).unwrap_or(u32::MAX),
-            header_crc: crc32(header),
-            hertz: self.board.hertz(),
+            header_crc: image.header_crc(),
+            revision: image.revision(),
+            target: image.target().into(),
+            hertz: self.lent.board.hertz(),
             parse_ticks: self.times.parse,
             check_ticks: self.times.check,
         };
         // The name is copied, since the board lends it and sends the message.
         let mut name = heapless::String::<32>::new();
-        let whole = self.board.name();
+        let whole = self.lent.board.name();
         let _ = name.push_str(whole.get(..whole.len().min(32)).unwrap_or_default());
         let message = Response::Identity(identity(&name));
-        self.sender.send(self.board, &message);
+        self.lent.sender.send(self.lent.board, &message);
     }
 
     /// Image and known answer, whole.
     fn self_test(&mut self) -> Result<(), Refusal> {
         self.abandon();
-        self.test.restart();
-        while !self.test.advance(&mut self.engine)? {
-            self.board.feed_watchdog();
-            self.sender.take_in(self.board);
+        self.lent.test.restart();
+        while !self.lent.test.advance(&mut self.engine)? {
+            self.lent.board.feed_watchdog();
+            self.lent.sender.take_in(self.lent.board);
         }
-        Ok(())
+        self.lent.store.confirm().map_err(Refusal::Update)
     }
 
     fn abandon(&mut self) {
         if self.frame.take().is_some() {
-            let counter = &mut self.sender.counters.abandoned_frames;
+            let counter = &mut self.lent.sender.counters.abandoned_frames;
             *counter = counter.saturating_add(1);
         }
     }
 
     fn begin(&mut self, number: u32, detail: Detail) -> Result<(), Refusal> {
         self.abandon();
-        self.test.failure().map_or(Ok(()), Err)?;
-        if self.configuration.needs_self_test && self.test.passed() == 0 {
+        self.lent.test.failure().map_or(Ok(()), Err)?;
+        if self.configuration.needs_self_test && self.lent.test.passed() == 0 {
             return Err(Refusal::Untested);
         }
         if let Some(last) = self.last_frame.filter(|last| *last >= number) {
@@ -258,7 +276,7 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
         let frame = self.frame.take().ok_or(Refusal::NoFrame)?;
         let mut sensed = self.rig.finish();
         if frame.is_incomplete {
-            let counter = &mut self.sender.counters.incomplete_frames;
+            let counter = &mut self.lent.sender.counters.incomplete_frames;
             *counter = counter.saturating_add(1);
             sensed = Sensed { camera: Some(Reading::Missing), lidar: Some(Reading::Missing) };
         }
@@ -274,7 +292,7 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
             return Err(Refusal::InputsMissing);
         }
         let (outcome, ticks) =
-            infer(&mut self.engine, self.board, self.sender, self.configuration.budget_ms, frame.detail);
+            infer(&mut self.engine, self.lent.board, self.lent.sender, self.configuration.budget_ms, frame.detail);
         let answer = match (outcome, &self.network) {
             (Ok(()), Some(network)) => network.answer(&self.engine),
             _ => Answer::None,
@@ -309,7 +327,8 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
         };
         let mut ran = (Err(NetworkError::Failed), 0);
         if self.rig.complete(&mut self.engine, Some(pending.inputs())) {
-            ran = infer(&mut self.engine, self.board, self.sender, self.configuration.budget_ms, frame.detail);
+            ran =
+                infer(&mut self.engine, self.lent.board, self.lent.sender, self.configuration.budget_ms, frame.detail);
         }
         let (outcome, ticks) = ran;
         let answer = outcome.map_or(Answer::None, |()| network.answer(&self.engine));
@@ -328,7 +347,7 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
             let bytes = self.engine.output(output.into()).unwrap_or_default();
             let mut offset = 0_u32;
             for bytes in bytes.chunks(MAX_PIECE) {
-                self.sender.send(self.board, &Response::Output { output, offset, bytes });
+                self.lent.sender.send(self.lent.board, &Response::Output { output, offset, bytes });
                 offset = offset.saturating_add(MAX_PIECE as u32);
             }
         }
@@ -336,8 +355,8 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
 
     /// Ends a frame of the drive: actuators and telemetry.
     fn finish(&mut self, frame: u32, output: Output, answer: Answer, ticks: u64) {
-        let duties = self.actuators.apply(&output);
-        self.last_end = Some(self.board.ticks());
+        let duties = self.lent.actuators.apply(&output);
+        self.last_end = Some(self.lent.board.ticks());
         self.report(frame, output, Some(duties), answer, ticks);
     }
 
@@ -349,6 +368,7 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
         answer: Answer,
         network_ticks: u64,
     ) {
+        log::ended(frame, output.status, network_ticks);
         let telemetry = Telemetry {
             frame,
             status: output.status,
@@ -357,18 +377,18 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels> Desk<'i, 'a, 'm, B, A, K> {
             answer,
             network_ticks,
             counters: *self.driver.counters(),
-            link: self.sender.counters,
-            self_tests: self.test.passed(),
-            stack_bytes: self.board.stack_bytes(),
+            link: self.lent.sender.counters,
+            self_tests: self.lent.test.passed(),
+            stack_bytes: self.lent.board.stack_bytes(),
         };
-        self.sender.send(self.board, &Response::Telemetry(telemetry));
+        self.lent.sender.send(self.lent.board, &Response::Telemetry(telemetry));
     }
 
     /// Stops the vehicle if no frame of its drive ended for too long.
     fn watch_silence(&mut self) {
         let Some(last) = self.last_end.filter(|_| self.configuration.silence_ms > 0) else { return };
-        let limit = u64::from(self.configuration.silence_ms).saturating_mul(self.board.hertz()) / 1000;
-        if self.board.ticks().wrapping_sub(last) > limit {
+        let limit = u64::from(self.configuration.silence_ms).saturating_mul(self.lent.board.hertz()) / 1000;
+        if self.lent.board.ticks().wrapping_sub(last) > limit {
             let output = self.driver.halt(Fault::Silence);
             self.finish(self.last_frame.unwrap_or(0), output, Answer::None, 0);
         }
@@ -398,6 +418,7 @@ fn infer<K: Kernels, B: Board>(
         board.feed_watchdog();
         sender.take_in(board);
         if detail.steps && progress.is_ok() {
+            log::step(&report);
             sender.send(board, &Response::Step(report));
         }
         match progress {

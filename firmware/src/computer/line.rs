@@ -1,7 +1,7 @@
 //! The board's end of the line: what was received, what is sent, and what got lost.
 
-use super::Board;
-use crate::link::{LinkCounters, MAX_ENCODED, Receiver, Response, encode};
+use super::{Board, log};
+use crate::link::{LinkCounters, MAX_ENCODED, Receiver, Refusal, Response, encode};
 use heapless::Deque;
 
 /// Bytes that may come in while a step of the network runs.
@@ -83,6 +83,18 @@ impl Sender {
             self.next_sent = self.next_sent.wrapping_add(1);
             board.send(bytes);
         }
+    }
+
+    /// Answers a request.
+    pub fn answer<B: Board>(&mut self, board: &mut B, request: u16, outcome: Result<(), Refusal>) {
+        let message = match outcome {
+            Ok(()) => Response::Accepted { request },
+            Err(reason) => {
+                log::refused(request, reason);
+                Response::Refused { request, reason }
+            }
+        };
+        self.send(board, &message);
     }
 
     pub fn count_damaged(&mut self) {

@@ -50,6 +50,7 @@ checks! {
     RegionName: "the memory region has an unknown name",
     RegionAlignment: "the arena alignment must be a power of two from 16 to 4096",
     ModelName: "the model name is not zero-padded UTF-8",
+    TargetName: "the target name is not zero-padded visible ASCII",
     SectionKind: "a section is not where this format has it",
     SectionOffset: "sections must follow each other without gaps",
     SectionLength: "the section has a wrong length",

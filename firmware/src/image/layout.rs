@@ -58,8 +58,12 @@ pub mod header {
     pub const REGIONS: Range<usize> = 128..192;
     /// [`super::SECTION_SLOTS`] section slots ([`super::section`]); unused ones are zero.
     pub const SECTIONS: Range<usize> = 192..320;
+    /// Name of the target that the image was compiled for, visible ASCII, padded with zeros; all zero where unknown.
+    pub const TARGET: Range<usize> = 320..336;
+    /// `u32`: revision of the model; [`crate::update`] refuses to go back.
+    pub const REVISION: Range<usize> = 336..340;
     /// Zero.
-    pub const RESERVED_B: Range<usize> = 320..380;
+    pub const RESERVED_B: Range<usize> = 340..380;
     /// `u32`: CRC-32 of all header bytes before it.
     pub const CRC: Range<usize> = 380..384;
     /// Size of the header.

@@ -52,6 +52,9 @@ fn read_header(bytes: &[u8]) -> Result<Image<'_>, ParseError> {
     check_reserved(bytes, header::SECTIONS.start.saturating_add(used)..header::SECTIONS.end)?;
     let name = bytes.get(header::NAME).unwrap_or_default();
     ensure(Check::ModelName, at(&header::NAME), text(name).is_some(), 0, 0)?;
+    let target = bytes.get(header::TARGET).unwrap_or_default();
+    let is_plain = text(target).is_some_and(|name| name.bytes().all(|byte| byte.is_ascii_graphic()));
+    ensure(Check::TargetName, at(&header::TARGET), is_plain, 0, 0)?;
     read_counts(bytes)
 }
 

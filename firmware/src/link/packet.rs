@@ -3,14 +3,14 @@
 use crate::image::{Digest, crc32, digest};
 use core::fmt;
 use heapless::Vec;
-use postcard::ser_flavors::{Cobs, Flavor, Slice};
+use postcard::ser_flavors::Flavor;
 use postcard::serialize_with_flavor;
 use serde::{Deserialize, Serialize};
 
 /// Most bytes of a packet before COBS: sequence number, message, CRC.
 pub const MAX_PACKET: usize = 1024;
-/// Most bytes of a packet on the line: COBS adds one byte per 254, and the zero.
-pub const MAX_ENCODED: usize = MAX_PACKET + MAX_PACKET.div_ceil(254) + 1;
+/// Most bytes of a packet on the line: COBS adds one byte per 254 begun, and the zero.
+pub const MAX_ENCODED: usize = MAX_PACKET + MAX_PACKET / 254 + 2;
 
 const CRC_BYTES: usize = 4;
 
@@ -54,23 +54,58 @@ impl fmt::Display for Damage {
 
 impl core::error::Error for Damage {}
 
-/// Appends the CRC of all bytes that pass.
-struct WithCrc<F> {
-    inner: F,
+/// Writes bytes as blocks of COBS and takes their CRC on the way. (postcard's own flavors index their buffer, which can
+/// panic.)
+struct Writer<'b> {
+    buffer: &'b mut [u8],
+    /// Where the code of the block under way goes.
+    code: usize,
+    /// Where its next byte goes.
+    end: usize,
     crc: Digest,
 }
 
-impl<F: Flavor> Flavor for WithCrc<F> {
-    type Output = F::Output;
+impl Writer<'_> {
+    fn put(&mut self, byte: u8) -> postcard::Result<()> {
+        if byte != 0 {
+            self.set(self.end, byte)?;
+            self.end = self.end.wrapping_add(1);
+        }
+        let is_full = self.end.wrapping_sub(self.code) == usize::from(u8::MAX);
+        if byte == 0 || is_full { self.end_block() } else { Ok(()) }
+    }
+
+    /// Writes the code of the block: its length with the code itself.
+    fn end_block(&mut self) -> postcard::Result<()> {
+        let length = u8::try_from(self.end.wrapping_sub(self.code)).map_err(|_| FULL)?;
+        self.set(self.code, length)?;
+        self.code = self.end;
+        self.end = self.end.wrapping_add(1);
+        Ok(())
+    }
+
+    fn set(&mut self, at: usize, byte: u8) -> postcard::Result<()> {
+        self.buffer.get_mut(at).map(|slot| *slot = byte).ok_or(FULL)
+    }
+}
+
+const FULL: postcard::Error = postcard::Error::SerializeBufferFull;
+
+impl<'b> Flavor for Writer<'b> {
+    type Output = &'b mut [u8];
 
     fn try_push(&mut self, byte: u8) -> postcard::Result<()> {
         self.crc.update(&[byte]);
-        self.inner.try_push(byte)
+        self.put(byte)
     }
 
-    fn finalize(mut self) -> postcard::Result<F::Output> {
-        self.crc.finalize().to_le_bytes().into_iter().try_for_each(|byte| self.inner.try_push(byte))?;
-        self.inner.finalize()
+    fn finalize(mut self) -> postcard::Result<&'b mut [u8]> {
+        let crc = self.crc.clone().finalize().to_le_bytes();
+        crc.into_iter().try_for_each(|byte| self.put(byte))?;
+        self.end_block()?;
+        // The place of the next block's code is the delimiter's.
+        self.set(self.code, 0)?;
+        self.buffer.get_mut(..self.end).ok_or(FULL)
     }
 }
 
@@ -79,8 +114,8 @@ impl<F: Flavor> Flavor for WithCrc<F> {
 /// # Errors
 /// The message is longer than a packet or than the buffer.
 pub fn encode<'b>(sequence: u16, message: &impl Serialize, buffer: &'b mut [u8]) -> Result<&'b mut [u8], TooLong> {
-    let cobs = Cobs::try_new(Slice::new(buffer)).map_err(|_| TooLong)?;
-    let encoded = serialize_with_flavor(&(sequence, message), WithCrc { inner: cobs, crc: digest() });
+    let writer = Writer { buffer, code: 0, end: 1, crc: digest() };
+    let encoded = serialize_with_flavor(&(sequence, message), writer);
     encoded.ok().filter(|encoded| encoded.len() <= MAX_ENCODED).ok_or(TooLong)
 }
 

@@ -5,6 +5,7 @@ use crate::drive::{Measurements, NetworkInputs, RouteNode};
 use crate::sensors::camera::{PixelFormat, Scale};
 use crate::sensors::lidar::Axes;
 use crate::sensors::views::View;
+use crate::update::Manifest;
 use fixed::types::I16F16;
 use serde::{Deserialize, Serialize};
 
@@ -51,6 +52,19 @@ pub enum Request<'a> {
     },
     /// The frame is complete: [`super::Response::Telemetry`].
     End(End),
+    /// A new image is to come; it is refused before a byte is erased if it is not for this board.
+    Announce(Manifest),
+    /// The next piece of the new image.
+    Piece {
+        /// Its first byte within the image.
+        offset: u32,
+        /// Bytes, at most [`super::MAX_PIECE`].
+        bytes: &'a [u8],
+    },
+    /// The new image is whole: checks it and makes it the one of the next start.
+    Install,
+    /// Starts the board anew, on trial with a new image.
+    Restart,
     /// Where a board's program can end (under an emulator), it ends.
     Halt,
 }
@@ -113,10 +127,11 @@ impl Default for Configuration {
     fn default() -> Self {
         let camera =
             CameraSetup { width: 400, height: 300, format: PixelFormat::Rgb, scale: Scale::Full, frozen_after: 40 };
+        const HEIGHT: I16F16 = I16F16::lit("2.5");
         Self {
             camera,
             lidar_axes: Axes::Carla,
-            lidar_height: I16F16::lit("2.5"),
+            lidar_height: HEIGHT,
             budget_ms: STEP_MS.into(),
             silence_ms: u32::from(STEP_MS).saturating_mul(4),
             needs_self_test: true,

@@ -2,6 +2,7 @@
 
 use crate::actuators::{ActuatorFault, Duties};
 use crate::drive::{Controls, Counters, Status};
+use crate::update::TargetName;
 use crate::waypoint::{MAX_WAYPOINTS, Waypoint};
 use core::fmt;
 use heapless::Vec;
@@ -57,6 +58,10 @@ pub struct Identity<'a> {
     pub image_bytes: u32,
     /// CRC-32 of the image's header and thereby of all section CRCs.
     pub header_crc: u32,
+    /// Revision of the model.
+    pub revision: u32,
+    /// Target that the image was compiled for.
+    pub target: TargetName,
     /// Ticks of the board's clock per second.
     pub hertz: u64,
     /// Ticks that `Image::parse` took.
@@ -169,6 +174,8 @@ pub enum Refusal {
     RouteFull,
     /// This board's program does not end.
     NoHalt,
+    /// The new image, or a piece of it.
+    Update(UpdateRefusal),
 }
 
 impl fmt::Display for Refusal {
@@ -187,8 +194,109 @@ impl fmt::Display for Refusal {
             Self::NoDriver => f.write_str("the image is no driving network's"),
             Self::RouteFull => f.write_str("the route is full; nodes that were passed make room"),
             Self::NoHalt => f.write_str("this board's program does not end"),
+            Self::Update(refusal) => refusal.fmt(f),
         }
     }
 }
 
 impl core::error::Error for Refusal {}
+
+/// Why a new image, or a piece of it, is not taken.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "defmt", derive(defmt::Format))]
+pub enum UpdateRefusal {
+    /// This board has no memory for a second image.
+    NoStore,
+    /// It has more bytes than a slot.
+    TooLarge {
+        /// Bytes of the image.
+        found: u32,
+        /// Bytes of the slot.
+        capacity: u32,
+    },
+    /// It was compiled for another target.
+    ForeignTarget {
+        /// The image's.
+        found: TargetName,
+        /// The board's.
+        expected: TargetName,
+    },
+    /// It needs features or kernels that this board does not have: their bits.
+    Features(u64),
+    /// It needs more arena than the board has in a memory region.
+    Arena {
+        /// The region, by position.
+        region: u8,
+        /// Bytes that it needs.
+        needed: u32,
+        /// Bytes that are there.
+        found: u32,
+    },
+    /// It has other inputs or outputs than the application needs.
+    Interface,
+    /// It is older than the image that runs.
+    Older {
+        /// Its revision.
+        found: u32,
+        /// That of the image that runs.
+        running: u32,
+    },
+    /// It is the image that runs.
+    Running,
+    /// What was received differs from what was announced.
+    NotAnnounced,
+    /// It is damaged, or no image of this format.
+    Damaged,
+    /// The running image is on trial: it has to meet its known answer first.
+    OnTrial,
+    /// None was announced.
+    NotBegun,
+    /// A piece does not continue the one before.
+    OutOfOrder {
+        /// The byte that is next.
+        expected: u32,
+    },
+    /// A piece ends behind the image.
+    TooLong {
+        /// Bytes of the image.
+        announced: u32,
+    },
+    /// Bytes are missing.
+    Incomplete {
+        /// Bytes that came.
+        found: u32,
+    },
+    /// The memory failed.
+    Flash,
+}
+
+impl fmt::Display for UpdateRefusal {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::NoStore => f.write_str("this board has no memory for a second image"),
+            Self::TooLarge { found, capacity } => write!(f, "image of {found} bytes, the slot has room for {capacity}"),
+            Self::ForeignTarget { found, expected } => {
+                write!(f, "image compiled for target {found}, this board is {expected}")
+            }
+            Self::Features(bits) => write!(f, "image needs features that this board does not have (bits {bits:#x})"),
+            Self::Arena { region, needed, found } => {
+                write!(f, "memory region {region}: image needs {needed} bytes of arena, there are {found}")
+            }
+            Self::Interface => f.write_str("image has other inputs or outputs than the running one"),
+            Self::Older { found, running } => {
+                write!(f, "image of revision {found} is older than the running {running}")
+            }
+            Self::Running => f.write_str("this image runs already"),
+            Self::NotAnnounced => f.write_str("what was received is not what was announced"),
+            Self::Damaged => f.write_str("what was received is damaged, or no image of this format"),
+            Self::OnTrial => f.write_str("the running image is on trial and has to meet its known answer first"),
+            Self::NotBegun => f.write_str("no image was announced"),
+            Self::OutOfOrder { expected } => write!(f, "a piece is out of order: byte {expected} is next"),
+            Self::TooLong { announced } => write!(f, "a piece ends behind the {announced} bytes that were announced"),
+            Self::Incomplete { found } => write!(f, "only {found} bytes of the image came"),
+            Self::Flash => f.write_str("the flash failed"),
+        }
+    }
+}
+
+impl core::error::Error for UpdateRefusal {}

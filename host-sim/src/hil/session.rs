@@ -4,8 +4,7 @@ use super::feeder::Feeder;
 use super::line::Line;
 use super::pieces::{Parcel, Reads, Setup};
 use firmware::drive::RouteNode;
-use firmware::image::layout::header;
-use firmware::image::{Image, crc32};
+use firmware::image::Image;
 use firmware::link::{Configuration, Detail, Identity, PROTOCOL, Refusal, Request, Response, StepReport, Telemetry};
 use firmware::sensors::lidar::Axes;
 use fixed::types::I16F16;
@@ -208,7 +207,7 @@ fn check(identity: &Identity<'_>, image: &Image<'_>) -> Result<()> {
         return Err(Error::new(ErrorCode::Link, "", message).with_help("build board and host-sim from one version"));
     }
     let bytes = image.bytes();
-    let crc = crc32(bytes.get(..header::CRC.start).unwrap_or(bytes));
+    let crc = image.header_crc();
     let digest = |digest: &[u8]| format!("{}…", artifact::hex(&digest[..SHOWN]));
     let length = |bytes: usize| format!("{bytes} bytes");
     let facts = [

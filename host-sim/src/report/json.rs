@@ -6,6 +6,7 @@ use crate::attention::AttentionReport;
 use crate::bench::figures::BenchReport;
 use crate::diff::Diff;
 use crate::drive::DriveReport;
+use crate::footprint::FootprintReport;
 use crate::gates::GateOutcome;
 use crate::hil::report::HilReport;
 use crate::metrics::{RouteLog, Score};
@@ -56,6 +57,8 @@ pub enum Document {
     Drive,
     /// Of a run on a board.
     Hil,
+    /// Of footprints.
+    Footprint,
     /// The log of a drive, which is read.
     RouteLog,
 }
@@ -70,6 +73,7 @@ pub fn schema(document: Document) -> Value {
         Document::Score => written().into_root_schema_for::<Score>(),
         Document::Drive => written().into_root_schema_for::<DriveReport>(),
         Document::Hil => written().into_root_schema_for::<HilReport>(),
+        Document::Footprint => written().into_root_schema_for::<FootprintReport>(),
         Document::RouteLog => SchemaSettings::default().into_generator().into_root_schema_for::<RouteLog>(),
     };
     schema.to_value()
@@ -135,6 +139,11 @@ pub fn drive(report: &DriveReport) -> Value {
 
 /// Document of a run on a board; one with a difference also has an `error`.
 pub fn hil(report: &HilReport) -> Value {
+    to_value(report)
+}
+
+/// Document of footprints.
+pub fn footprint(report: &FootprintReport) -> Value {
     to_value(report)
 }
 

@@ -17,7 +17,8 @@ pub const COMPILE: &str = "Examples:
   model-compiler compile transfuser.pth --calib frames/ --target cortex-m7 -o transfuser.img
   model-compiler compile resnet20.onnx --calib images/ -o resnet20.img
   model-compiler compile transfuser.qmodel --ram 1536K --flash 128M -o transfuser.img
-  model-compiler compile transfuser.qmodel --target board.toml -o transfuser.img";
+  model-compiler compile transfuser.qmodel --target board.toml -o transfuser.img
+  model-compiler compile transfuser.qmodel --target cortex-m7 --revision 2 -o transfuser.img";
 
 pub const INSPECT: &str = "Examples:
   model-compiler inspect transfuser.img

@@ -60,6 +60,8 @@ fn image(bytes: &[u8]) -> Result<String> {
     let _ = writeln!(text, "model image  {}", image.name());
     let _ = writeln!(text, "sha256       {}", hex(&artifact::sha256(bytes)));
     let _ = writeln!(text, "qmodel       {}", hex(&image.qmodel_digest()));
+    let _ = writeln!(text, "target       {}", if image.target().is_empty() { "unknown" } else { image.target() });
+    let _ = writeln!(text, "revision     {}", image.revision());
     let _ = writeln!(text, "bytes        {}", bytes.len());
     let _ = writeln!(text, "arena        {} B, aligned to {}", image.arena_bytes(), image.arena_alignment());
     let _ = writeln!(text, "steps        {}", image.step_count());

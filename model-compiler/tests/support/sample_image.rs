@@ -172,6 +172,8 @@ pub fn parts() -> ImageParts {
         ],
         arena_bytes,
         arena_alignment: 16,
+        target: "cortex-m4".into(),
+        revision: 3,
         qmodel_digest: [7; 32],
         build_digest: [9; 32],
         known_answer: Some(KnownAnswer { seed: 42, step_crcs: vec![0; STEPS] }),

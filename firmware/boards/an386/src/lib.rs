@@ -4,12 +4,13 @@
 
 use board_support::arena::Arena;
 use board_support::counter::CmsdkTimer;
+use board_support::image_memory::ImageMemory;
 use board_support::uart::CmsdkUart;
-use board_support::{Board, image_memory, mps2};
+use board_support::{Board, mps2};
 use firmware::kernels::Portable;
 
 const PSRAM: usize = 0x2100_0000;
-const PSRAM_BYTES: usize = 16 << 20;
+const PSRAM_BYTES: u32 = 16 << 20;
 const ARENA_BYTES: usize = 160 << 10;
 
 static mut ARENA: Arena<ARENA_BYTES> = Arena([0; ARENA_BYTES]);
@@ -19,9 +20,9 @@ static mut ARENA: Arena<ARENA_BYTES> = Arena([0; ARENA_BYTES]);
 /// # Safety
 /// The program runs on this board, and calls this once.
 pub unsafe fn board() -> Board<CmsdkUart, CmsdkTimer, Portable> {
-    // SAFETY: this is an MPS2 board, its devices are made once, and nothing here writes its PSRAM.
-    let (machine, (image, behind)) = unsafe { (mps2::machine("an386"), image_memory::stored(PSRAM, PSRAM_BYTES)) };
+    // SAFETY: this is an MPS2 board, its devices and its PSRAM are taken once.
+    let (machine, images) = unsafe { (mps2::machine("an386"), ImageMemory::new(PSRAM, PSRAM_BYTES)) };
     // SAFETY: the only reference ever, since this is called once.
     let arena = unsafe { &mut *&raw mut ARENA };
-    Board { machine, image, behind, kernels: Portable, arena: &mut arena.0 }
+    Board { machine, images, target: "cortex-m4", kernels: Portable, arena: &mut arena.0 }
 }

@@ -44,3 +44,21 @@ unsafe fn call(operation: usize, block: &mut [usize; 2]) -> usize {
     }
     answer
 }
+
+#[cfg(feature = "defmt")]
+use defmt_semihosting as _;
+
+/// No board here enables an interrupt, and each runs one core: nothing can come between.
+#[cfg(feature = "defmt")]
+mod critical_section_of_one_core {
+    struct OneCore;
+
+    critical_section::set_impl!(OneCore);
+
+    // SAFETY: one core without interrupts runs one section at a time.
+    unsafe impl critical_section::Impl for OneCore {
+        unsafe fn acquire() -> critical_section::RawRestoreState {}
+
+        unsafe fn release((): critical_section::RawRestoreState) {}
+    }
+}

@@ -3,15 +3,16 @@
 #![no_std]
 
 use board_support::counter::Counter;
+use board_support::image_memory::ImageMemory;
 use board_support::uart::Pl011;
-use board_support::{Board, Machine, image_memory};
+use board_support::{Board, Machine};
 use core::arch::{asm, global_asm};
 use core::slice;
 use firmware::kernels::Portable;
 
 const UART: usize = 0x0900_0000;
 const IMAGE: usize = 0x5000_0000;
-const IMAGE_BYTES: usize = 192 << 20;
+const IMAGE_BYTES: u32 = 192 << 20;
 const ARENA: usize = 0x4800_0000;
 const ARENA_BYTES: usize = 64 << 20;
 
@@ -69,8 +70,14 @@ pub unsafe fn board() -> Board<Pl011, GenericTimer, Portable> {
     // SAFETY: the board's UART, made once.
     let uart = unsafe { Pl011::new(UART) };
     // SAFETY: both ranges are RAM of the board, apart from each other and from what the linker uses; any bytes are
-    // valid, no other reference to them exists, and nothing writes the image's.
-    let ((image, behind), arena) =
-        unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
-    Board { machine: Machine { name: "virt", uart, counter: GenericTimer }, image, behind, kernels: Portable, arena }
+    // valid, and no other reference to them exists.
+    let (images, arena) =
+        unsafe { (ImageMemory::new(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
+    Board {
+        machine: Machine { name: "virt", uart, counter: GenericTimer },
+        images,
+        target: "cortex-a",
+        kernels: Portable,
+        arena,
+    }
 }

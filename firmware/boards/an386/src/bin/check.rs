@@ -9,6 +9,6 @@ use cortex_m_rt::entry;
 #[entry]
 fn main() -> ! {
     // SAFETY: this is the board, and nothing else takes it.
-    let mut board = unsafe { an386::board() };
-    semihosting::exit(check::run(&mut board))
+    let mut bench = unsafe { an386::board() }.bench();
+    semihosting::exit(check::run(&mut bench))
 }

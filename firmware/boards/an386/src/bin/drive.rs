@@ -11,8 +11,8 @@ static mut WORKSPACE: Workspace = Workspace::new();
 #[entry]
 fn main() -> ! {
     // SAFETY: this is the board, and nothing else takes it.
-    let mut board = unsafe { an386::board() };
+    let board = unsafe { an386::board() };
     // SAFETY: the only reference ever, since `main` runs once.
     let workspace = unsafe { &mut *&raw mut WORKSPACE };
-    semihosting::exit(drive::run(&mut board, workspace))
+    semihosting::exit(drive::run(board, workspace))
 }

@@ -1,7 +1,7 @@
 //! Conformance: the board's backend against the portable one, operator by operator, and the digest of all bytes
 //! written, which the host's sweep over as large a workspace must give, too.
 
-use crate::board::Board;
+use crate::board::Bench;
 use crate::counter::Counter;
 use crate::machine::say;
 use crate::uart::Uart;
@@ -13,12 +13,12 @@ use firmware::kernels::Kernels;
 const SEED: u64 = 1;
 
 /// Runs the sweep and answers the exit status: 0 the backend conforms, 1 not.
-pub fn run<U: Uart, C: Counter, K: Kernels>(board: &mut Board<U, C, K>) -> u8 {
-    u8::from(sweep(board).is_err())
+pub fn run<U: Uart, C: Counter, K: Kernels>(bench: &mut Bench<U, C, K>) -> u8 {
+    u8::from(sweep(bench).is_err())
 }
 
-fn sweep<U: Uart, C: Counter, K: Kernels>(board: &mut Board<U, C, K>) -> fmt::Result {
-    let Board { machine, kernels, arena, .. } = board;
+fn sweep<U: Uart, C: Counter, K: Kernels>(bench: &mut Bench<U, C, K>) -> fmt::Result {
+    let Bench { machine, kernels, arena, .. } = bench;
     let bytes = arena.len().min(WORKSPACE_BYTES);
     let workspace = arena.get_mut(..bytes).unwrap_or_default();
     let Summary { cases, elements, left_out, digest } = say(machine, conformance::check(kernels, SEED, workspace))?;

@@ -1,14 +1,16 @@
-//! The product: the [driving computer](firmware::computer) on a board.
+//! The product: the [driving computer](firmware::computer) on a board, with two slots for images.
 
 use crate::board::Board;
 use crate::counter::Counter;
 use crate::machine::Machine;
 use crate::pwm::{Pin, Pwm};
-use crate::stack;
 use crate::uart::Uart;
+use crate::{reset, stack};
 use firmware::actuators::Actuators;
-use firmware::computer::{self, Exit, Line, Memory, serve};
+use firmware::computer::{self, Computer, Exit, Line, Memory};
+use firmware::image::Image;
 use firmware::kernels::Kernels;
+use firmware::update::{self, Requirements, Updater};
 
 /// What the computer works with beside arena and stack.
 #[derive(Debug)]
@@ -30,14 +32,27 @@ impl Default for Workspace {
     }
 }
 
-/// Drives until the feeder ends it.
-pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>, workspace: &mut Workspace) -> u8 {
+/// Drives with the newest image of the two slots until the feeder ends it. Answers the exit status.
+pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(board: Board<U, C, K>, workspace: &mut Workspace) -> u8 {
+    let Board { mut machine, images, target, kernels, arena } = board;
+    let Workspace { memory, line } = workspace;
+    let mut flash = images.flash();
+    // The board's memory has two halves of whole sectors.
+    let Ok(slots) = flash.slots() else { return 2 };
+    let arenas = [u32::try_from(arena.len()).unwrap_or(u32::MAX)];
+    let requirements = Requirements { target, kernels: kernels.supported(), arenas: &arenas, interface: &|_| true };
+    // Without one to run, the computer waits for one.
+    let selected = update::select(&mut flash, &slots, &requirements, &mut || {}).ok();
+    let image = selected.and_then(|selected| flash.lend(selected.range())).unwrap_or_default();
+    let is_known = |new: &Image<'_>| Image::parse(image).map_or(true, |old| update::same_interface(&old, new));
+    let requirements = Requirements { interface: &is_known, ..requirements };
+    let mut store = Updater::new(flash, slots, requirements, selected);
     let mut actuators =
         Actuators { steering: Pwm::new(0), throttle: Pwm::new(1), brake: Pwm::new(2), enable: Pin::new(0) };
-    let Board { machine, image, kernels, arena, .. } = board;
-    let Workspace { memory, line } = workspace;
-    match serve(image, *kernels, arena, memory, line, machine, &mut actuators) {
+    let (board, actuators, store) = (&mut machine, &mut actuators, &mut store);
+    match (Computer { image, kernels, arena, memory, line, board, actuators, store }).run() {
         Exit::Halt => 0,
+        Exit::Restart => reset::system(),
     }
 }
 

@@ -5,7 +5,7 @@
 //! over the frames that lie behind the image. Each step prints the fewest and the most instructions that it took.
 //! Under `-icount shift=6` these are exact, up to one where the counter's tick is no divisor of 64 ns.
 
-use crate::board::Board;
+use crate::board::Bench;
 use crate::counter::Counter;
 use crate::machine::{Machine, say};
 use crate::stack::Mark;
@@ -55,19 +55,19 @@ enum Inputs<'a> {
 }
 
 /// Measures and answers the exit status: 0 measured, 1 the image or a step was refused.
-pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -> u8 {
-    u8::from(measure(board).is_err())
+pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> u8 {
+    u8::from(measure(bench).is_err())
 }
 
-fn measure<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -> fmt::Result {
-    let Board { machine, image: bytes, behind, kernels, arena } = board;
+fn measure<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> fmt::Result {
+    let Bench { machine, image: bytes, behind, kernels, arena } = bench;
     let name = machine.name;
     let mark = Mark::new();
-    let (parsed, parse_instructions) = timed(machine, || parse(bytes));
+    let (parsed, parse_ticks) = timed(machine, || parse(bytes));
     let image = say(machine, parsed)?;
     let parse_stack = mark.depth_bytes();
     let mark = Mark::new();
-    let (checked, check_instructions) = timed(machine, || check(&image));
+    let (checked, check_ticks) = timed(machine, || check(&image));
     say(machine, checked)?;
     let check_stack = mark.depth_bytes();
 
@@ -85,16 +85,16 @@ fn measure<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -
         say(machine, fill(&mut engine, &image, inputs))?;
         let (mut total, mut progress) = (0, Progress::Running { next: 0 });
         for span in steps.iter_mut().take(image.step_count().into()) {
-            let (done, instructions) = timed(machine, || step(&mut engine));
+            let (done, ticks) = timed(machine, || step(&mut engine));
             progress = say(machine, done)?;
-            span.add(instructions);
-            total += instructions;
+            span.add(machine.counter.instructions(ticks));
+            total += ticks;
         }
         if progress != Progress::Done {
             writeln!(machine, "{name}: more than {MAX_STEPS} steps")?;
             return Err(fmt::Error);
         }
-        whole.add(total);
+        whole.add(machine.counter.instructions(total));
         runs += 1;
     }
     let step_stack = mark.depth_bytes();
@@ -106,17 +106,18 @@ fn measure<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -
         writeln!(machine, "{position:4} {name:<18} {span}")?;
     }
     writeln!(machine, "     {:<18} {whole}", "network")?;
-    writeln!(machine, "     {:<18} {parse_instructions:>12}", "parse")?;
-    writeln!(machine, "     {:<18} {check_instructions:>12}", "check")?;
+    for (name, ticks) in [("parse", parse_ticks), ("check", check_ticks)] {
+        let instructions = machine.counter.instructions(ticks);
+        writeln!(machine, "     {name:<18} {instructions:>12}")?;
+    }
     writeln!(machine, "stack: parse {parse_stack}, check {check_stack}, step {step_stack} bytes")
 }
 
-/// What `work` answers, and its instructions.
+/// What `work` answers, and its ticks.
 fn timed<U: Uart, C: Counter, T>(machine: &mut Machine<U, C>, work: impl FnOnce() -> T) -> (T, u64) {
     let start = machine.counter.ticks();
     let answer = work();
-    let ticks = machine.counter.ticks() - start;
-    (answer, machine.counter.instructions(ticks))
+    (answer, machine.counter.ticks() - start)
 }
 
 // Functions of their own, so that the linked program has a symbol whose depth of stack can be bounded.

@@ -3,7 +3,7 @@
 //! Prints a line per step (position, operator, instructions) and answers whether all bytes were right. The known answer
 //! is the f64 model's, so this shows that the board computes what the host's independent model computes.
 
-use crate::board::Board;
+use crate::board::Bench;
 use crate::counter::Counter;
 use crate::machine::say;
 use crate::stack;
@@ -14,17 +14,17 @@ use firmware::image::Image;
 use firmware::kernels::Kernels;
 
 /// Runs the self-test and answers the exit status: 0 all bytes right, 1 not.
-pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -> u8 {
-    let outcome = test(board);
+pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> u8 {
+    let outcome = test(bench);
     let verdict = if outcome.is_ok() { "passed" } else { "failed" };
     let (peak, capacity) = (stack::peak_bytes(), stack::capacity_bytes());
     // A UART takes whatever it is given.
-    let _ = writeln!(board.machine, "stack: {peak} of {capacity} bytes\nself-test {verdict}");
+    let _ = writeln!(bench.machine, "stack: {peak} of {capacity} bytes\nself-test {verdict}");
     u8::from(outcome.is_err())
 }
 
-fn test<U: Uart, C: Counter, K: Kernels + Copy>(board: &mut Board<U, C, K>) -> fmt::Result {
-    let Board { machine, image: bytes, kernels, arena, .. } = board;
+fn test<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> fmt::Result {
+    let Bench { machine, image: bytes, kernels, arena, .. } = bench;
     let board = machine.name;
     let image = say(machine, Image::parse(bytes))?;
     writeln!(

@@ -8,6 +8,6 @@ use board_support::semihosting;
 #[unsafe(no_mangle)]
 extern "C" fn main() -> ! {
     // SAFETY: this is the board, and nothing else takes it.
-    let mut board = unsafe { virt::board() };
-    semihosting::exit(check::run(&mut board))
+    let mut bench = unsafe { virt::board() }.bench();
+    semihosting::exit(check::run(&mut bench))
 }

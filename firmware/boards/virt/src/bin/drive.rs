@@ -10,8 +10,8 @@ static mut WORKSPACE: Workspace = Workspace::new();
 #[unsafe(no_mangle)]
 extern "C" fn main() -> ! {
     // SAFETY: this is the board, and nothing else takes it.
-    let mut board = unsafe { virt::board() };
+    let board = unsafe { virt::board() };
     // SAFETY: the only reference ever, since `main` runs once.
     let workspace = unsafe { &mut *&raw mut WORKSPACE };
-    semihosting::exit(drive::run(&mut board, workspace))
+    semihosting::exit(drive::run(board, workspace))
 }
