@@ -3,7 +3,18 @@
 use crate::run::Waypoints;
 use firmware::drive::profile::Answer as AnswerKind;
 use firmware::drive::{NetworkError, NetworkOutput};
+use firmware::image::Image;
+use firmware::link;
 use firmware::waypoint::{self, Waypoint};
+
+/// Name of the output that holds controls; waypoints and points are the first output.
+pub const CONTROLS: &str = "controls";
+
+/// The output of an image that drives.
+pub fn output_of(image: &Image<'_>) -> u8 {
+    let controls = |&index: &_| image.output(index).is_some_and(|port| port.name == CONTROLS);
+    (0..image.output_count()).find(controls).unwrap_or(0)
+}
 
 /// What a network gave, owned.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,6 +40,16 @@ impl Answer {
                 let codes = <[i32; 3]>::try_from(codes).ok()?;
                 Some(Self::Controls(codes.map(|code| code.clamp(i16::MIN.into(), i16::MAX.into()) as i16)))
             }
+        }
+    }
+
+    /// What a board told; `None` where its network gave nothing to drive by.
+    pub fn of_board(told: &link::Answer) -> Option<Self> {
+        match told {
+            link::Answer::None => None,
+            link::Answer::Waypoints(waypoints) => Some(Self::Waypoints(waypoints.to_vec())),
+            link::Answer::ImagePoints(points) => Some(Self::ImagePoints(points.to_vec())),
+            link::Answer::Controls(codes) => Some(Self::Controls(*codes)),
         }
     }
 
@@ -59,6 +80,16 @@ impl Answer {
             Self::ImagePoints(points) => Ok(NetworkOutput::ImagePoints(points)),
             Self::Controls(codes) => Ok(NetworkOutput::Controls(*codes)),
             Self::NotFinite => Err(NetworkError::Failed),
+        }
+    }
+
+    /// Points in the image `[column, row]` in pixels, where the network gives such.
+    pub fn points_px(&self) -> Option<Vec<[f64; 2]>> {
+        match self {
+            Self::ImagePoints(points) => {
+                Some(points.iter().map(|point| point.map(|code| f64::from(code) / 64.0)).collect())
+            }
+            _ => None,
         }
     }
 

@@ -1,5 +1,5 @@
-//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `drive`, `score`, `bench`,
-//! `footprint`, `schema`, `completions`, and the demo without any of them.
+//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `drive`, `hil`, `score`, `bench`, `footprint`,
+//! `schema`, `completions`, and the demo without any of them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
@@ -13,6 +13,7 @@ use bench::BenchArgs;
 use clap::{Args, Parser, Subcommand};
 use diff::DiffArgs;
 use footprint::FootprintArgs;
+use hil::HilArgs;
 use indicatif::ProgressBar;
 use model_compiler::cli::{CompletionArgs, ImportArgs, progress_bar};
 use model_compiler::error::{Error, ErrorCode, Result};
@@ -26,6 +27,7 @@ mod diff;
 mod examples;
 mod footprint;
 mod gates;
+mod hil;
 mod verify;
 
 pub use model_compiler::cli::Console;
@@ -115,6 +117,17 @@ enum Command {
         /// Write drive.html and drive.json to this folder.
         #[arg(long, value_name = "DIR")]
         report: Option<PathBuf>,
+        #[command(flatten)]
+        common: Common,
+    },
+    /// Feeds a board over its serial line, in the emulator or a real one, and compares every output byte with the host's.
+    ///
+    /// The board runs the `drive` program of firmware/boards. Exit status 1 at the first difference, 2 where the board is
+    /// missing, silent, refuses, or holds another image.
+    #[command(after_help = examples::HIL)]
+    Hil {
+        #[command(flatten)]
+        hil: HilArgs,
         #[command(flatten)]
         common: Common,
     },
@@ -259,6 +272,7 @@ impl Command {
             | Self::Footprint { common, .. }
             | Self::Attention { common, .. }
             | Self::Drive { common, .. }
+            | Self::Hil { common, .. }
             | Self::Score { common, .. }
             | Self::Schema { common, .. } => Some(common),
             Self::Completions(_) => None,
@@ -290,6 +304,7 @@ impl Command {
                 console.print(&if common.json { json::drive(&report).to_string() } else { terminal::drive(&report) });
                 Ok(0)
             }
+            Self::Hil { hil, common } => hil.execute(&common, console, progress),
             Self::Score { logs, common } => {
                 let score = metrics::score(&logs)?;
                 console.print(&if common.json { json::score(&score).to_string() } else { terminal::score(&score) });

@@ -110,7 +110,7 @@ pub struct Decision {
 }
 
 impl Decision {
-    fn new(output: Output, answer: Option<&Answer>) -> Self {
+    pub(crate) fn new(output: Output, answer: Option<&Answer>) -> Self {
         let [steer, throttle, brake] =
             [output.controls.steer, output.controls.throttle, output.controls.brake].map(|value| value.to_num());
         let (status, status_code) = (output.status.to_string(), output.status.code());

@@ -10,6 +10,7 @@
 //! * [`attention`]: how often the fusing transformer looks from one sensor to the other, in integers and in f32
 //! * [`metrics`]: how well a car drove, from the logs of whole routes
 //! * [`mod@drive`]: a recorded sequence through sensors, network, planner and controller, int8 beside f32
+//! * [`mod@hil`]: the image on a board, in the emulator or real, and every byte that comes back against the host's
 //! * [`report`]: what was found, as text, JSON and one HTML page; [`diff`] against an earlier report, [`gates`] for CI,
 //!   and where the noise at the output comes from ([`noise`])
 //!
@@ -40,6 +41,7 @@ pub mod drive;
 pub mod files;
 pub mod footprint;
 pub mod gates;
+pub mod hil;
 pub mod histogram;
 pub mod metrics;
 pub mod noise;

@@ -302,7 +302,8 @@ impl<'a> Device<'a> {
         self.outputs.iter().enumerate().map(real).collect()
     }
 
-    fn input_bytes(&self, frame: &Frame) -> Result<Vec<Vec<u8>>> {
+    /// Bytes of the inputs as the host prepares them.
+    pub(crate) fn input_bytes(&self, frame: &Frame) -> Result<Vec<Vec<u8>>> {
         let ports = (0..self.image.input_count()).filter_map(|i| self.image.input(i));
         let encode = |port: Port<'_>| {
             let kind = files::input_kind(&port)?;

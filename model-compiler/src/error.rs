@@ -24,6 +24,8 @@ pub enum ErrorCode {
     TooBig,
     /// An integer bound of the arithmetic would be exceeded.
     Numeric,
+    /// A board does not answer, answers damaged, or refuses.
+    Link,
     /// A check ran and failed (unequal bytes, missed gate).
     Check,
 }
@@ -41,6 +43,7 @@ impl ErrorCode {
             Self::Usage => "usage",
             Self::TooBig => "too_big",
             Self::Numeric => "numeric",
+            Self::Link => "link",
             Self::Check => "check",
         }
     }

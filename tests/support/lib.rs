@@ -17,6 +17,7 @@ pub mod onnxruntime;
 pub mod project;
 pub mod random;
 pub mod random_graph;
+pub mod serial_board;
 pub mod sketch;
 pub mod torch_file;
 pub mod trial;

@@ -12,6 +12,7 @@ Examples:
   host-sim ablate transfuser.pth --calib frames/ --frames drive/
   host-sim attention transfuser.img --model transfuser.pth --frames drive/
   host-sim drive transfuser.img --log drive/
+  host-sim hil transfuser.img --board an386 --frames frames/
   host-sim score route-1.json route-2.json
   host-sim footprint firmware.elf
   host-sim completions bash";
@@ -37,6 +38,7 @@ pub const SCHEMA: &str = "Examples:
   host-sim schema
   host-sim schema run
   host-sim schema attention
+  host-sim schema hil
   host-sim schema route-log";
 
 pub const ABLATE: &str = "Examples:
@@ -53,6 +55,14 @@ pub const DRIVE: &str = "Examples:
   host-sim drive transfuser.img --log drive/
   host-sim drive transfuser.img --log drive/ --model transfuser.pth --report out/
   host-sim drive transfuser.img --log drive/ --json";
+
+pub const HIL: &str = "Examples:
+  host-sim hil transfuser.img --board an386 --frames frames/
+  host-sim hil transfuser.img --board an547 --frames frames/ --steps --json
+  host-sim hil transfuser.img --board virt --inputs inputs.safetensors
+  host-sim hil transfuser.img --board an500 --log drive/
+  host-sim hil transfuser.img --port /dev/ttyACM0 --baud 1000000 --frames frames/ --crop
+  host-sim hil transfuser.img --port /dev/ttyACM0 --log drive/ --budget-ms 50 --silence-ms 200 --background";
 
 pub const SCORE: &str = "Examples:
   host-sim score route-1.json route-2.json

@@ -57,8 +57,10 @@ pub struct LoggedFrame {
     pub folder: PathBuf,
     /// What the sensors said, images and points left out.
     pub measurements: Measurements,
-    /// How the LiDAR sits on the vehicle.
-    pub mounting: Mounting,
+    /// How the LiDAR's coordinates lie.
+    pub lidar_axes: Axes,
+    /// Its height above ground, m.
+    pub lidar_height: I16F16,
 }
 
 impl Log {
@@ -116,14 +118,20 @@ fn folders(path: &Path) -> Result<Vec<PathBuf>> {
 }
 
 impl LoggedFrame {
+    /// How the LiDAR sits on the vehicle.
+    pub fn mounting(&self) -> Mounting {
+        Mounting::new(self.lidar_axes, self.lidar_height)
+    }
+
     fn read(folder: &Path) -> Result<Self> {
-        let description = Description::read(folder.join(DESCRIPTION))?;
+        let description = Description::of_folder(folder)?;
         let place = match description.json.get("gps") {
             None => {
                 description.reading(Sensor::Position, "position", "[north_m, east_m]", |v| pair(v).map(position))?
             }
             Some(_) => description.reading(Sensor::Position, "gps", "[latitude, longitude] in degrees", gps)?,
         };
+        let (lidar_axes, lidar_height) = description.lidar()?;
         let present = |sensor| if description.missing.contains(&sensor) { Reading::Missing } else { Reading::now(()) };
         Ok(Self {
             name: folder.file_name().unwrap_or_default().to_string_lossy().into_owned(),
@@ -135,19 +143,25 @@ impl LoggedFrame {
                 position: place,
                 compass: description.reading(Sensor::Compass, "compass", "radians", real)?,
             },
-            mounting: description.mounting()?,
+            lidar_axes,
+            lidar_height,
         })
     }
 }
 
 /// `frame.json`, with the path for messages.
-struct Description {
+pub(crate) struct Description {
     path: PathBuf,
     json: Value,
     missing: Vec<Sensor>,
 }
 
 impl Description {
+    /// The description in a frame's folder.
+    pub(crate) fn of_folder(folder: &Path) -> Result<Self> {
+        Self::read(folder.join(DESCRIPTION))
+    }
+
     fn read(path: PathBuf) -> Result<Self> {
         let text = std::fs::read_to_string(&path).map_err(|e| Error::io(&path, &e).with_help(FRAME_HELP))?;
         let json = serde_json::from_str(&text).map_err(|e| format!("not JSON: {e}"));
@@ -189,7 +203,13 @@ impl Description {
         }
     }
 
-    fn mounting(&self) -> Result<Mounting> {
+    /// Goal `[right, forward]`, m, where there is one.
+    pub(crate) fn goal(&self) -> Option<[f64; 2]> {
+        pair(self.json.get("goal")?)
+    }
+
+    /// Axes of the LiDAR and its height, m.
+    pub(crate) fn lidar(&self) -> Result<(Axes, I16F16)> {
         let axes = match self.json.get("lidar_axes").filter(|v| !v.is_null()).map(Value::as_str) {
             None | Some(Some("carla")) => Axes::Carla,
             Some(Some("velodyne")) => Axes::Velodyne,
@@ -199,7 +219,7 @@ impl Description {
             None => Some(TRAINED_HEIGHT),
             Some(height) => height.as_f64().and_then(I16F16::checked_from_num),
         };
-        Ok(Mounting::new(axes, height.ok_or_else(|| self.bad("lidar_height_m", "meters"))?))
+        Ok((axes, height.ok_or_else(|| self.bad("lidar_height_m", "meters"))?))
     }
 
     fn bad(&self, field: &str, expected: &str) -> Error {

@@ -1,7 +1,7 @@
 //! The two networks of a drive: the engine's integers, and the f32 network on the same inputs.
 
 use super::sensors::Rig;
-use crate::answer::Answer;
+use crate::answer::{self, Answer, CONTROLS};
 use crate::backends::Backend;
 use crate::buffers::GuardedArena;
 use crate::codes::decode;
@@ -12,9 +12,6 @@ use firmware::tensor::ElementType;
 use model_compiler::error::{Error, ErrorCode, Result};
 use model_compiler::ir::Graph;
 use model_compiler::reference;
-
-/// Name of the output that holds controls; waypoints and points are the first output.
-const CONTROLS: &str = "controls";
 
 /// An image on the engine.
 pub struct IntegerNetwork<'a> {
@@ -32,8 +29,7 @@ impl<'a> IntegerNetwork<'a> {
     /// # Errors
     /// It has no output.
     pub fn new(image: Image<'a>, backend: Backend, kind: AnswerKind) -> Result<Self> {
-        let controls = |&index: &_| image.output(index).is_some_and(|port| port.name == CONTROLS);
-        let output = (0..image.output_count()).find(controls).unwrap_or(0);
+        let output = answer::output_of(&image);
         let record = image.output(output).and_then(|port| image.tensor(port.tensor));
         let element = record.map(|record| record.element).ok_or_else(|| {
             Error::new(ErrorCode::Unsupported, format!("network {}", image.name()), "it has no output")

@@ -100,7 +100,7 @@ impl<'a> Rig<'a> {
         let refuse = |e| Error::new(ErrorCode::Unsupported, "input `bev`", format!("{e}"));
         let mut sweep = Sweep::new(histogram);
         sweep.start(counts).map_err(refuse)?;
-        points.iter().for_each(|&point| sweep.push(frame.mounting.place(point), counts));
+        points.iter().for_each(|&point| sweep.push(frame.mounting().place(point), counts));
         Ok(sweep.finish().into())
     }
 }
@@ -169,7 +169,7 @@ fn cells(shape: Shape, frame: &LoggedFrame, points: &[[u32; 3]]) -> Result<[Vec<
     let mut lists = Correspondences::new(Intrinsics::PUBLISHED);
     let refuse = |e| Error::new(ErrorCode::Unsupported, "input `bev_points`", format!("{e}"));
     lists.start(&mut bev, &mut camera).map_err(refuse)?;
-    points.iter().for_each(|&point| lists.push(frame.mounting.place(point), &mut bev, &mut camera));
+    points.iter().for_each(|&point| lists.push(frame.mounting().place(point), &mut bev, &mut camera));
     lists.finish();
     Ok([bev, camera])
 }

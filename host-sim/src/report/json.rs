@@ -8,6 +8,7 @@ use crate::diff::Diff;
 use crate::drive::DriveReport;
 use crate::footprint::FootprintReport;
 use crate::gates::GateOutcome;
+use crate::hil::report::HilReport;
 use crate::metrics::{RouteLog, Score};
 use crate::run::RunReport;
 use model_compiler::error::{Error, ErrorCode, Result};
@@ -54,6 +55,8 @@ pub enum Document {
     Score,
     /// Of a replayed log.
     Drive,
+    /// Of a run on a board.
+    Hil,
     /// Of footprints.
     Footprint,
     /// The log of a drive, which is read.
@@ -69,6 +72,7 @@ pub fn schema(document: Document) -> Value {
         Document::Attention => written().into_root_schema_for::<AttentionReport>(),
         Document::Score => written().into_root_schema_for::<Score>(),
         Document::Drive => written().into_root_schema_for::<DriveReport>(),
+        Document::Hil => written().into_root_schema_for::<HilReport>(),
         Document::Footprint => written().into_root_schema_for::<FootprintReport>(),
         Document::RouteLog => SchemaSettings::default().into_generator().into_root_schema_for::<RouteLog>(),
     };
@@ -130,6 +134,11 @@ pub fn score(score: &Score) -> Value {
 
 /// Document of a replayed log.
 pub fn drive(report: &DriveReport) -> Value {
+    to_value(report)
+}
+
+/// Document of a run on a board; one with a difference also has an `error`.
+pub fn hil(report: &HilReport) -> Value {
     to_value(report)
 }
 

@@ -13,6 +13,7 @@ mod attention;
 mod bench;
 mod drive;
 mod footprint;
+mod hil;
 mod run;
 mod score;
 
@@ -20,6 +21,7 @@ pub use attention::attention;
 pub use bench::bench;
 pub use drive::drive;
 pub use footprint::footprint;
+pub use hil::hil;
 pub use run::run;
 pub use score::score;
 
