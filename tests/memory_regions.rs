@@ -8,6 +8,7 @@ use firmware::kernels::Portable;
 use firmware::tensor::TensorId;
 use host_sim::buffers::GuardedArena;
 use model_compiler::emit::AlignedBytes;
+use model_compiler::error::{ErrorCode, Result};
 use model_compiler::import::System;
 use model_compiler::memory_plan::{MemoryPlan, PlanOptions};
 use model_compiler::pipeline::{self, Compiled};
@@ -23,13 +24,16 @@ use tests::{build, bundle, random_graph};
 const NETWORKS: u64 = 24;
 const NAMES: [&str; 4] = ["fast", "main", "slow", "slower"];
 
-fn spread(model: &QModel, sizes: &[u64]) -> Compiled {
+fn try_to_spread(model: &QModel, sizes: &[u64]) -> Result<Compiled> {
     let region = |(name, bytes): (&&str, &u64)| Region { name: (*name).into(), bytes: Some(*bytes) };
     let regions = NAMES.iter().zip(sizes).map(region).collect();
     let target = Target::find("portable").and_then(|t| t.with_regions(regions)).unwrap_or_else(|e| panic!("{e}"));
     let options = PlanOptions::for_target(&target);
-    let compiled = pipeline::compile(model, &target, &options, &mut |_, _, _| {});
-    compiled.unwrap_or_else(|e| panic!("{} in {sizes:?}: {e}", model.name))
+    pipeline::compile(model, &target, &options, &mut |_, _, _| {})
+}
+
+fn spread(model: &QModel, sizes: &[u64]) -> Compiled {
+    try_to_spread(model, sizes).unwrap_or_else(|e| panic!("{} in {sizes:?}: {e}", model.name))
 }
 
 /// Output bytes of every step on seeded inputs. Before each step every byte that holds nothing is set to `poison`.
@@ -90,7 +94,7 @@ fn assert_kept(plan: &MemoryPlan, sizes: &[u64], what: &str) {
 
 #[test]
 fn random_networks_give_the_same_bytes_in_any_regions() {
-    let mut spread_out = 0;
+    let (mut plans, mut spread_out) = (0, 0);
     for seed in 0..NETWORKS {
         let mut graph = random_graph::graph(seed);
         model_compiler::passes::optimize(&mut graph).unwrap_or_else(|e| panic!("seed {seed}: {e}"));
@@ -104,7 +108,12 @@ fn random_networks_give_the_same_bytes_in_any_regions() {
         let arena = one.record.plan.arena_bytes();
         for sizes in [vec![arena / 4, arena], vec![arena / 2, arena * 3 / 4], vec![arena / 8, arena / 3, arena]] {
             let what = format!("seed {seed}, {sizes:?}");
-            let compiled = spread(&model, &sizes);
+            let compiled = match try_to_spread(&model, &sizes) {
+                // Where no region can hold everything, a network of few large maps need not be divisible at all.
+                Err(error) if error.code == ErrorCode::TooBig && sizes.iter().all(|size| *size < arena) => continue,
+                compiled => compiled.unwrap_or_else(|e| panic!("{what}: {e}")),
+            };
+            plans += 1;
             assert_kept(&compiled.record.plan, &sizes, &what);
             assert_eq!(compiled.record.plan.order, one.record.plan.order, "{what}");
             for poison in [0x5A, 0xA5] {
@@ -114,8 +123,8 @@ fn random_networks_give_the_same_bytes_in_any_regions() {
             spread_out += usize::from(used == sizes.len());
         }
     }
-    println!("{spread_out} of {} plans use every region", 3 * NETWORKS);
-    assert!(spread_out > 2 * NETWORKS as usize);
+    println!("{plans} of {} plans fit, {spread_out} use every region", 3 * NETWORKS);
+    assert!(plans > 5 * NETWORKS / 2 && spread_out > 2 * NETWORKS as usize);
 }
 
 #[test]

@@ -92,13 +92,6 @@ pub struct ArenaPart {
     pub traffic_bytes: u64,
 }
 
-impl ArenaPart {
-    /// Bytes that are used beyond the region's size.
-    pub fn excess_bytes(&self) -> u64 {
-        self.capacity.map_or(0, |capacity| self.bytes.saturating_sub(capacity))
-    }
-}
-
 /// The plan of one model for one target.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct MemoryPlan {

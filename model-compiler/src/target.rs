@@ -158,9 +158,9 @@ impl Target {
     /// `TooBig`: what is too big by how much; for the arena also the step at the peak and what is live there, for one
     /// in several regions also what the others hold and what all need together.
     pub fn fits(&self, model: &QModel, plan: &MemoryPlan, image_bytes: u64) -> Result<()> {
-        let overfull = (0_u8..).zip(&plan.regions).find(|(_, part)| part.excess_bytes() > 0);
-        if let Some((region, part)) = overfull {
-            let limit = part.capacity.unwrap_or(u64::MAX);
+        let parts = (0_u8..).zip(&plan.regions).zip(&self.regions);
+        let mut limits = parts.filter_map(|((number, part), region)| Some((number, part, region.bytes?)));
+        if let Some((region, part, limit)) = limits.find(|(_, part, limit)| part.bytes > *limit) {
             let (what, others, help) = match plan.regions.as_slice() {
                 [_] => ("arena".to_owned(), String::new(), help(part)),
                 parts => (format!("arena in region {}", part.name), others(parts, region), help_of_many(model, plan)),

@@ -32,20 +32,21 @@ pub(super) fn spread(job: &Job<'_>, all: &Pairs, capacities: &[Option<u64>]) -> 
     let mut best: Option<(u64, Layout)> = None;
     for _ in 0..PACKINGS {
         let layout = packed(job, choose(job, all, &budgets));
-        let excess = |(packing, capacity): (&solver::Packing, &u64)| packing.peak.saturating_sub(*capacity);
-        let over: Vec<u64> = layout.packings.iter().zip(&capacities).map(excess).collect();
         nodes.iter_mut().zip(&layout.packings).for_each(|(sum, packing)| *sum += packing.nodes);
-        // What does not even fit by its live bytes no packing can mend.
-        let fragments = layout.packings.iter().zip(&capacities).map(|(packing, &capacity)| packing.bound <= capacity);
-        let mended: Vec<bool> = fragments.zip(&over).map(|(fits, over)| fits && *over > 0).collect();
-        for ((budget, over), mend) in budgets.iter_mut().zip(&over).zip(&mended) {
-            *budget = if *mend { budget.saturating_sub(*over) } else { *budget };
+        let (mut over, mut is_mended) = (0, false);
+        for ((budget, packing), &capacity) in budgets.iter_mut().zip(&layout.packings).zip(&capacities) {
+            let excess = packing.peak.saturating_sub(capacity);
+            over += excess;
+            // What does not even fit by its live bytes no packing can mend.
+            if excess > 0 && packing.bound <= capacity {
+                *budget = budget.saturating_sub(excess);
+                is_mended = true;
+            }
         }
-        let sum = over.iter().sum();
-        if best.as_ref().is_none_or(|(least, _)| sum < *least) {
-            best = Some((sum, layout));
+        if best.as_ref().is_none_or(|(least, _)| over < *least) {
+            best = Some((over, layout));
         }
-        if !mended.contains(&true) {
+        if !is_mended {
             break;
         }
     }
@@ -59,7 +60,7 @@ struct Choice {
     pairs: Pairs,
     items: Items,
     region_of: Vec<usize>,
-    /// Bytes beyond the budget of the last region, at its fullest step.
+    /// Bytes beyond the budgets, at the fullest step of each region.
     overflow: u64,
     /// Traffic per region.
     traffic: Vec<u64>,
@@ -84,6 +85,7 @@ impl Choice {
             *region = faster;
             memory.take(faster, shape);
         }
+        self.overflow = memory.overflow();
     }
 
     /// What the items take.
@@ -177,7 +179,7 @@ fn assign(job: &Job<'_>, pairs: Pairs, key: Key, budgets: &[u64]) -> Choice {
         order.retain(|item| !misfits.contains(item));
         order.splice(0..0, misfits);
     }
-    let (overflow, region_of) = best.unwrap_or_default();
+    let (overflow, region_of) = best.expect("there are rounds");
     let mut by_region = vec![0; budgets.len()];
     let traffic = items.traffic(job.needs, job.order);
     region_of.iter().zip(traffic).for_each(|(&region, bytes)| by_region[region] += bytes);
@@ -200,14 +202,14 @@ fn joined(job: &Job<'_>, all: &Pairs, choice: Choice, budgets: &[u64]) -> Choice
     joined
 }
 
-/// Packs every region.
+/// Packs every region, each within its part of the nodes.
 fn packed(job: &Job<'_>, choice: Choice) -> Layout {
     let Choice { pairs, items, region_of, traffic, .. } = choice;
     let mut offsets = vec![0; items.shapes.len()];
     let pack = |region: usize| {
         let here: Vec<usize> = (0..region_of.len()).filter(|&item| region_of[item] == region).collect();
         let shapes: Vec<solver::Item> = here.iter().map(|&item| items.shapes[item].clone()).collect();
-        let packing = solver::pack(&shapes, job.node_limit);
+        let packing = solver::pack(&shapes, job.node_limit / PACKINGS as u64);
         here.iter().zip(&packing.offsets).for_each(|(&item, &offset)| offsets[item] = offset);
         packing
     };

@@ -86,6 +86,9 @@ fn close_to_the_best_of_all_assignments() {
             println!("seed {seed}: not found");
             continue;
         }
+        let layout = spread(&job, &all, &budgets.map(Some));
+        let packed = layout.packings.iter().zip(budgets).all(|(packing, budget)| packing.peak <= budget);
+        assert!(packed, "seed {seed}: {:?}", layout.packings);
         assert!(choice.traffic <= best, "seed {seed}: {:?}, best of all {best:?}", choice.traffic);
         found += 1;
         equal += u32::from(choice.traffic == best);
