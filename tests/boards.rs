@@ -2,27 +2,13 @@
 
 use firmware::image::Image;
 use model_compiler::emit::AlignedBytes;
-use model_compiler::frames::{self, FrameFormat};
 use model_compiler::import::{ImportOptions, System, import};
 use model_compiler::ir::Graph;
-use model_compiler::memory_plan::PlanOptions;
-use model_compiler::passes::{PassOptions, optimize};
-use model_compiler::pipeline;
+use model_compiler::passes::optimize;
 use model_compiler::quantize::QuantizeOptions;
-use model_compiler::target::Target;
 use tests::boards::{ALL, Run};
 use tests::golden::{Lbc, Network};
 use tests::{build, bundle};
-
-/// The bundled network, compiled for a microcontroller.
-fn bundled() -> Vec<u8> {
-    let (import, passes) = (ImportOptions::default(), PassOptions::default());
-    let graph = pipeline::load_graph(&bundle::checkpoint_path(), &import, &passes).unwrap();
-    let frames = frames::load(&bundle::frames_path("calibration"), &FrameFormat::of_graph(&graph)).unwrap();
-    let model = pipeline::quantize_graph(&graph, &frames, &QuantizeOptions::default(), &mut |_, _, _| {}).unwrap();
-    let target = Target::find("cortex-m4").unwrap();
-    pipeline::compile(&model, &target, &PlanOptions::for_target(&target), &mut |_, _, _| {}).unwrap().image
-}
 
 /// A small network at its own resolution, which fits a microcontroller's RAM.
 fn small(network: &Network) -> Graph {
@@ -43,7 +29,7 @@ fn reported_steps(run: &Run) -> usize {
 
 #[test]
 fn every_board_gives_the_known_answer_of_the_bundled_network() {
-    let image = bundled();
+    let image = bundle::for_microcontroller().image;
     for board in ALL {
         let Some(run) = board.run(&image) else { continue };
         assert_eq!(run.status, Some(0), "{}:\n{}", board.name, run.console);
@@ -69,7 +55,7 @@ fn every_system_gives_its_known_answer_on_the_cortex_m4() {
 
 #[test]
 fn a_changed_weight_is_noticed_on_the_board() {
-    let mut image = bundled();
+    let mut image = bundle::for_microcontroller().image;
     let middle = image.len() / 2;
     image[middle] ^= 1;
     let Some(run) = ALL[0].run(&image) else { return };

@@ -249,6 +249,9 @@ fn options_of_the_target_change_the_plan_only() {
     assert!(aligned > smallest && aligned % 128 == 0, "{aligned}");
     let offsets = folder.ok("model-compiler inspect @o.record");
     assert_holds(&offsets, &["target           board"]);
+    assert_holds(&folder.ok("model-compiler inspect @o.img"), &["target       board\n", "revision     0\n"]);
+    proven(&folder, "", " --revision 7");
+    assert_holds(&folder.ok("model-compiler inspect @o.img"), &["target       portable\n", "revision     7\n"]);
 }
 
 #[test]

@@ -12,7 +12,7 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use tests::boards::{IN_C, Run};
+use tests::boards::{ALL, Program, Run};
 use tests::golden::Network;
 use tests::{build, c_header};
 
@@ -94,7 +94,7 @@ fn a_program_in_c_runs_a_model_on_this_machine() {
 #[test]
 fn a_program_in_c_runs_a_model_on_the_cortex_m4() {
     let mut image = image();
-    let Some(Run { status, console }) = IN_C.run(&image) else { return };
+    let Some(Run { status, console }) = ALL[0].run_program(Program::InC, "", &image) else { return };
     let lines: Vec<&str> = console.lines().collect();
     assert_eq!(status, Some(0), "{console}");
     let parsed = AlignedBytes::from(image.as_slice());
@@ -109,14 +109,14 @@ fn a_program_in_c_runs_a_model_on_the_cortex_m4() {
     assert_eq!(lines, [&facts[..], &waypoints(&image)].concat());
     let middle = image.len() / 2;
     image[middle] ^= 1;
-    let Some(Run { status, console }) = IN_C.run(&image) else { return };
+    let Some(Run { status, console }) = ALL[0].run_program(Program::InC, "", &image) else { return };
     let expected = "error: image: a section of the image does not agree with its CRC\n";
     assert_eq!((status, console.as_str()), (Some(1), expected));
 }
 
 #[test]
 fn no_panic_is_linked_into_a_program_in_c() {
-    let Some(program) = IN_C.built_program() else { return };
+    let Some(program) = ALL[0].built_program(Program::InC) else { return };
     let bytes = fs::read(&program).unwrap();
     let file = object::File::parse(&*bytes).unwrap();
     let names: Vec<&str> = file.symbols().filter_map(|symbol| symbol.name().ok()).collect();

@@ -29,8 +29,9 @@ fn meters(value: f64) -> I16F16 {
 /// The histogram of a sweep, in the runtime's integers.
 fn sweep(histogram: Histogram, points: impl IntoIterator<Item = Result<Point, NotFinite>>) -> (Vec<i8>, Statistics) {
     let mut counts = vec![99; histogram.shape().elements() as usize];
-    let mut sweep = Sweep::new(histogram, &mut counts).unwrap();
-    points.into_iter().for_each(|point| sweep.push(point));
+    let mut sweep = Sweep::new(histogram);
+    sweep.start(&mut counts).unwrap();
+    points.into_iter().for_each(|point| sweep.push(point, &mut counts));
     let statistics = sweep.finish();
     (counts, statistics)
 }
@@ -105,8 +106,9 @@ fn golden_points_join_the_cells_of_f64() {
         }
     }
     let (mut bev, mut camera) = ([99; ELEMENTS], [99; ELEMENTS]);
-    let mut lists = Correspondences::new(Intrinsics::PUBLISHED, &mut bev, &mut camera).unwrap();
-    points.iter().for_each(|point| lists.push(place(point)));
+    let mut lists = Correspondences::new(Intrinsics::PUBLISHED);
+    lists.start(&mut bev, &mut camera).unwrap();
+    points.iter().for_each(|point| lists.push(place(point), &mut bev, &mut camera));
     let statistics = lists.finish();
     assert_eq!((statistics.points as usize, statistics.not_finite), (points.len(), 0));
     assert!(lengths.as_flattened().as_flattened().iter().filter(|&&length| length == ENTRIES).count() > 20);

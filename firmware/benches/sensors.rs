@@ -82,11 +82,13 @@ fn lidar(criterion: &mut Criterion) {
     for (name, is_moved) in [("histogram", false), ("histogram with motion", true)] {
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
-                let mut sweep = Sweep::new(Histogram::TRANSFUSER, &mut counts).expect("the histogram's size");
+                let mut sweep = Sweep::new(Histogram::TRANSFUSER);
+                sweep.start(&mut counts).expect("the histogram's size");
                 let motion = black_box(Motion::NONE);
                 for &bits in black_box(&points) {
                     let point = Mounting::TRAINED.place(bits);
-                    sweep.push(if is_moved { point.map(|point| motion.apply(point)) } else { point });
+                    let point = if is_moved { point.map(|point| motion.apply(point)) } else { point };
+                    sweep.push(point, &mut counts);
                 }
                 sweep.finish()
             });
@@ -95,9 +97,11 @@ fn lidar(criterion: &mut Criterion) {
     let (mut bev, mut camera) = ([0; ELEMENTS], [0; ELEMENTS]);
     group.bench_function("correspondences", |bencher| {
         bencher.iter(|| {
-            let lists = Correspondences::new(Intrinsics::PUBLISHED, &mut bev, &mut camera);
-            let mut lists = lists.expect("the inputs' sizes");
-            black_box(&points).iter().for_each(|&bits| lists.push(Mounting::TRAINED.place(bits)));
+            let mut lists = Correspondences::new(Intrinsics::PUBLISHED);
+            lists.start(&mut bev, &mut camera).expect("the inputs' sizes");
+            for &bits in black_box(&points) {
+                lists.push(Mounting::TRAINED.place(bits), &mut bev, &mut camera);
+            }
             lists.finish()
         });
     });

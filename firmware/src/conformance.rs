@@ -3,11 +3,13 @@
 //! It runs wherever the firmware runs: on a host, in an emulator, on silicon. Every array of a step is drawn on its
 //! own, in one of several styles (random, all at one extreme, extremes in turn), within the bounds that the compiler
 //! keeps; output, residual and scratch begin as garbage. A backend conforms if it writes the very bytes that `Portable`
-//! writes.
+//! writes. That `Portable` itself writes the same bytes on every instruction set is what [`Summary::digest`] tells.
 
 use crate::image::known_answer::Generator;
+use crate::image::{self, Digest};
 use crate::kernels::{Kernels, Portable};
 use crate::tensor::{CodesMut, ElementType};
+use bytemuck::NoUninit;
 use core::fmt;
 use draw::{Buffer, Draw};
 
@@ -28,6 +30,9 @@ pub struct Summary {
     pub elements: u64,
     /// Steps that did not fit in the workspace.
     pub left_out: u32,
+    /// CRC-32 of what the backend wrote, step after step: equal on every machine for the same seed, length of the
+    /// workspace (which starts at a multiple of 16) and kernels.
+    pub digest: u32,
 }
 
 /// The first difference of a sweep. The same seed finds it again.
@@ -113,10 +118,11 @@ const OPERATORS: [Operator; 18] = [
 pub fn check(kernels: &dyn Kernels, seed: u64, workspace: &mut [u8]) -> Result<Summary, Mismatch> {
     let mut summary = Summary::default();
     let mut seeds = Generator::new(seed);
+    let mut digest = image::digest();
     for operator in &OPERATORS {
         for number in 0..operator.cases {
             let draw = Draw::new(Generator::new(seeds.draw()), workspace);
-            let mut case = Case { draw, kernels, shapes: Shapes::new() };
+            let mut case = Case { draw, kernels, shapes: Shapes::new(), digest: &mut digest };
             match (operator.run)(&mut case, number) {
                 None => summary.left_out += 1,
                 Some(Ok(elements)) => {
@@ -130,6 +136,7 @@ pub fn check(kernels: &dyn Kernels, seed: u64, workspace: &mut [u8]) -> Result<S
             }
         }
     }
+    summary.digest = digest.finalize();
     Ok(summary)
 }
 
@@ -138,6 +145,8 @@ struct Case<'m> {
     draw: Draw<'m>,
     kernels: &'m dyn Kernels,
     shapes: Shapes,
+    /// Of what the backend wrote so far.
+    digest: &'m mut Digest,
 }
 
 impl Case<'_> {
@@ -159,12 +168,17 @@ impl Case<'_> {
         found.bytes.copy_from_slice(expected.bytes);
         step(&Portable, expected.codes_mut()?);
         step(self.kernels, found.codes_mut()?);
-        let difference = match (found.codes_mut()?, expected.codes_mut()?) {
-            (CodesMut::I8(found), CodesMut::I8(expected)) => first_difference(found, expected, elements),
-            (CodesMut::I16(found), CodesMut::I16(expected)) => first_difference(found, expected, elements),
+        match (found.codes_mut()?, expected.codes_mut()?) {
+            (CodesMut::I8(found), CodesMut::I8(expected)) => self.judge(found, expected, elements),
+            (CodesMut::I16(found), CodesMut::I16(expected)) => self.judge(found, expected, elements),
             _ => None,
-        };
-        Some(difference.map_or(Ok(elements), Err))
+        }
+    }
+
+    /// Compares the first `elements`, and adds what was found to the digest.
+    fn judge<T: NoUninit + Into<i32>>(&mut self, found: &[T], expected: &[T], elements: usize) -> Outcome {
+        self.digest.update(bytemuck::cast_slice(found.get(..elements)?));
+        Some(first_difference(found, expected, elements).map_or(Ok(elements), Err))
     }
 }
 
@@ -202,6 +216,15 @@ mod tests {
         let cases: u32 = OPERATORS.iter().map(|operator| operator.cases).sum();
         assert_eq!((summary.cases, summary.left_out), (cases, 0));
         assert!(summary.elements > 1_000_000, "{summary:?}");
+    }
+
+    #[test]
+    fn the_digest_follows_the_bytes() {
+        let mut workspace = vec![0; 20_000];
+        let mut digest =
+            |kernels: &dyn Kernels, seed| check(kernels, seed, &mut workspace).map(|summary| summary.digest);
+        assert_eq!(digest(&Portable, SEED), digest(&Portable, SEED), "the garbage in the workspace takes no part");
+        assert_ne!(digest(&Portable, SEED), digest(&Portable, SEED + 1));
     }
 
     #[test]

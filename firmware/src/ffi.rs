@@ -42,12 +42,13 @@
     clippy::panic
 )]
 
+use crate::arena::Regions;
 use crate::engine::{Engine, EngineError, Progress};
 use crate::image::layout::{self, MAX_PORTS};
 use crate::image::{Image, Port};
 use crate::kernels::Portable;
 use core::ffi::{c_char, c_void};
-use memory::{Place, memory, memory_mut, overlap, place, result};
+use memory::{NOWHERE, Place, memory, memory_mut, overlap, place, result};
 
 mod memory;
 mod message;
@@ -68,8 +69,8 @@ struct State {
     mark: u64,
     /// Why the last call failed.
     error: Option<EngineError>,
-    /// The region, so that inputs can be told from it.
-    arena: Place,
+    /// The regions, so that inputs can be told from them; as many as the image has.
+    arena: [Place; MAX_REGIONS],
     engine: Engine<'static, Portable>,
 }
 
@@ -187,20 +188,31 @@ pub unsafe extern "C" fn fw_engine_init(
         if !regions.is_aligned() {
             return Err(Status::Misaligned);
         }
-        if region_count != 1 {
+        if !(1..=MAX_REGIONS).contains(&region_count) {
             return Err(Status::RegionCount);
         }
-        // SAFETY: not null, aligned, and the caller vouches for one region there.
-        let region = unsafe { regions.read() };
-        let (image, arena) = (place(image, image_bytes)?, place(region.memory, region.bytes)?);
-        if overlap(image, arena) || [image, arena].into_iter().any(|other| overlap(other, storage(engine))) {
+        let image = place(image, image_bytes)?;
+        let mut arena = [NOWHERE; MAX_REGIONS];
+        for index in 0..region_count {
+            // SAFETY: not null, aligned, and the caller vouches for `region_count` of them.
+            let region = unsafe { regions.wrapping_add(index).read() };
+            let region = place(region.memory, region.bytes)?;
+            if [image, storage(engine)].iter().chain(&arena).any(|other| overlap(region, *other)) {
+                return Err(Status::Overlap);
+            }
+            if let Some(slot) = arena.get_mut(index) {
+                *slot = region;
+            }
+        }
+        if overlap(image, storage(engine)) {
             return Err(Status::Overlap);
         }
         // SAFETY: the caller vouches for the bytes and keeps them unchanged as long as the engine is used.
         let image: &'static [u8] = unsafe { memory(image) };
-        // SAFETY: the caller gives the region to this engine alone; it shares no byte with engine or image.
-        let memory: &'static mut [u8] = unsafe { memory_mut(arena) };
-        let engine = Engine::new(Image::parse(image)?, Portable, memory)?;
+        // SAFETY: the caller gives the regions to this engine alone; they share no byte with each other, engine or image.
+        let lend = |region: &Place| -> &'static mut [u8] { unsafe { memory_mut(*region) } };
+        let regions: Regions<'static> = arena.iter().take(region_count).map(lend).collect();
+        let engine = Engine::new(Image::parse(image)?, Portable, regions)?;
         // SAFETY: the storage is aligned and large enough for the state (asserted above), and the caller's to give.
         unsafe { state.write(State { mark: MARK, error: None, arena, engine }) };
         Ok(())
@@ -216,7 +228,7 @@ pub unsafe extern "C" fn fw_engine_explain(engine: *mut EngineStorage, text: *mu
         // SAFETY: the caller vouches for the engine.
         let state = unsafe { state(engine)? };
         let text = place(text.cast(), capacity)?;
-        if overlap(text, storage(engine)) || overlap(text, state.arena) {
+        if overlap(text, storage(engine)) || state.owns(text) {
             return Err(Status::Overlap);
         }
         // SAFETY: the caller vouches for the text, which is no part of engine or arena.
@@ -301,7 +313,7 @@ pub unsafe extern "C" fn fw_start(engine: *mut EngineStorage, inputs: *const Byt
             // SAFETY: not null, aligned, and the caller vouches for `count` of them.
             let Bytes { data, bytes } = unsafe { inputs.wrapping_add(index).read() };
             let input = place(data, bytes)?;
-            if overlap(input, state.arena) || overlap(input, storage(engine)) {
+            if overlap(input, storage(engine)) || state.owns(input) {
                 return Err(Status::Overlap);
             }
             // SAFETY: the caller vouches for the bytes, which are no part of engine or arena.
@@ -405,6 +417,11 @@ pub unsafe extern "C" fn fw_self_test_step(engine: *mut EngineStorage, progress:
 }
 
 impl State {
+    /// Whether a byte of this place lies in a region.
+    fn owns(&self, place: Place) -> bool {
+        self.arena.iter().any(|region| overlap(place, *region))
+    }
+
     /// A call of the engine; why it failed is remembered.
     fn call<T>(
         &mut self,

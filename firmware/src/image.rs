@@ -7,7 +7,7 @@
 //!
 //! | part | content | covered by |
 //! |---|---|---|
-//! | header, 384 bytes | magic, format, counts, features, name, digests, regions, section table | header CRC |
+//! | header, 384 bytes | magic, format, counts, features, name, target, revision, digests, regions, sections | header CRC |
 //! | ports | inputs, then outputs: tensor, zero point, scale (metadata), name; 32 bytes each | section CRC |
 //! | tensors | 32-byte records `{region, type, offset, bytes, dims, first_step, last_step, in_place_of}` | section CRC |
 //! | step index | first byte of every step in the program, `u32` each | section CRC |
@@ -18,6 +18,9 @@
 //! Sections follow each other without gaps, each padded with zeros to a multiple of 16. A section's CRC covers its
 //! padding and is stored in the section table; the header CRC covers the table; reserved bytes are zero; the file is as
 //! long as the header says. CRCs are CRC-32/ISO-HDLC.
+//!
+//! The arena lies in one to four memory regions (tightly coupled `fast`, SRAM `main`, external `slow`), listed fastest
+//! first; one, named `main`, is the ordinary case. A tensor record names its region and its offset there.
 //!
 //! A tensor record is also the live range: `first_step` writes the tensor (0 for inputs), `last_step` reads it for the
 //! last time (the program's last step for outputs). Scratch is a record of type `Scratch` with no shape that one step
@@ -44,7 +47,7 @@
 //! ```
 //!
 //! At 0 magic, format 1, 1 step, length; at 0x10 features: bit 6 (requantize); at 0x18 2 tensors, 1 input, 1 output, 1
-//! region. At 0x80 the region `main`: 32 bytes, aligned to 16. At 0xC0 the section table `(kind, offset, length, CRC)`.
+//! region. At 0x80 the region `main`: 32 bytes, aligned to 16 (further regions would follow). At 0xC0 the section table `(kind, offset, length, CRC)`.
 //! At 0x17C the header CRC. At 0x180 the two ports, at 0x1C0 the two tensor records, at 0x200 the step index, at 0x210
 //! the step: variant 6, input 0, output 1, zero point 0, multiplier and shift, zero point 0, bounds −128..127.
 #![deny(
@@ -68,13 +71,17 @@ pub mod known_answer;
 pub mod layout;
 mod parse;
 mod records;
+mod region;
 mod stored;
 
+pub(crate) use checker::Cursor;
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
+pub(crate) use checker::{Digest, digest};
 pub use checks::{Check, ParseError, Place};
 pub(crate) use checks::{ensure, ensure_equal, shown};
 pub use known_answer::KnownAnswer;
 pub use records::{Port, TensorRecord, text};
+pub use region::{Region, RegionName};
 pub use stored::StoredImage;
 
 /// A section of the file; the number is its slot in the header.
@@ -128,18 +135,27 @@ struct Section {
     crc: u32,
 }
 
+impl Section {
+    /// The section's bytes in the file, with its padding.
+    fn padded(self, file: &[u8]) -> &[u8] {
+        let start = index(self.offset);
+        let end = start.saturating_add(index(self.length)).checked_next_multiple_of(layout::ALIGNMENT);
+        end.and_then(|end| file.get(start..end)).unwrap_or_default()
+    }
+}
+
 /// A parsed image: a view of the caller's bytes and a proof that [`Image::parse`] accepted them.
 #[derive(Clone, Copy, Debug)]
 pub struct Image<'a> {
     bytes: &'a [u8],
     sections: [Section; layout::SECTIONS],
     features: u64,
-    arena_bytes: u32,
-    arena_alignment: u32,
+    regions: [Region; layout::REGION_SLOTS],
     step_count: u16,
     tensor_count: u16,
     input_count: u8,
     output_count: u8,
+    region_count: u8,
     work: u64,
 }
 
@@ -183,19 +199,49 @@ impl<'a> Image<'a> {
         self.bytes.get(at).and_then(|field| field.try_into().ok()).unwrap_or_default()
     }
 
+    /// Name of the target that the image was compiled for, empty where unknown.
+    pub fn target(&self) -> &'a str {
+        self.bytes.get(layout::header::TARGET).and_then(text).unwrap_or_default()
+    }
+
+    /// Revision of the model: what an update compares.
+    pub fn revision(&self) -> u32 {
+        bytes::u32_at(self.bytes, layout::header::REVISION).unwrap_or_default()
+    }
+
+    /// CRC-32 of the header. As the header holds the CRCs of all sections, it tells images apart.
+    pub fn header_crc(&self) -> u32 {
+        bytes::u32_at(self.bytes, layout::header::CRC).unwrap_or_default()
+    }
+
     /// Union of the feature bits of all steps and kernels.
     pub fn features(&self) -> u64 {
         self.features
     }
 
-    /// Bytes of arena that an [`crate::engine::Engine`] needs.
-    pub fn arena_bytes(&self) -> u32 {
-        self.arena_bytes
+    /// The memory regions, fastest first: an [`crate::engine::Engine`] needs a buffer in each, in this order.
+    pub fn regions(&self) -> impl Iterator<Item = Region> + '_ {
+        self.regions.iter().take(self.region_count.into()).copied()
     }
 
-    /// Alignment that the arena needs.
+    /// A memory region, by position; `None` behind the last.
+    pub fn region(&self, region: u8) -> Option<Region> {
+        self.regions().nth(region.into())
+    }
+
+    /// Number of memory regions, at least one.
+    pub fn region_count(&self) -> u8 {
+        self.region_count
+    }
+
+    /// Bytes of arena that an [`crate::engine::Engine`] needs, in all regions together.
+    pub fn arena_bytes(&self) -> u32 {
+        self.regions().fold(0, |sum, region| sum.saturating_add(region.bytes))
+    }
+
+    /// The largest alignment that a region needs.
     pub fn arena_alignment(&self) -> u32 {
-        self.arena_alignment
+        self.regions().map(|region| region.alignment).max().unwrap_or_default()
     }
 
     /// Number of steps.
@@ -309,10 +355,7 @@ impl<'a> Image<'a> {
 
     /// The bytes of a section with its padding.
     fn padded_section(&self, kind: SectionKind) -> &'a [u8] {
-        let Section { offset, length, .. } = self.slot(kind);
-        let start = index(offset);
-        let end = start.saturating_add(index(length)).checked_next_multiple_of(layout::ALIGNMENT);
-        end.and_then(|end| self.bytes.get(start..end)).unwrap_or_default()
+        self.slot(kind).padded(self.bytes)
     }
 
     /// CRC-32 that the header records for a section.

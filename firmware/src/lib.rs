@@ -1,7 +1,7 @@
 //! Runtime for quantized driving networks: `no_std`, no heap, no float in inference, no panic after validation.
 //!
 //! A network arrives as a *model image*, written by the compiler and executed in place. The runtime proves once that
-//! the image cannot lead it astray, and then runs it step by step in a buffer that the caller owns:
+//! the image cannot lead it astray, and then runs it step by step in memory that the caller owns:
 //!
 //! ```
 //! use firmware::engine::{Engine, EngineError, Progress};
@@ -25,13 +25,15 @@
 //!
 //! # Layers, top first
 //!
+//! * [`computer`]: the whole driving computer behind a serial [`link`]: frames in, [`actuators`] set, telemetry out.
 //! * [`drive`]: around the network: route, goal, waypoints to steer, throttle and brake, supervision. Fixed point.
 //! * [`engine`]: `start`, `step`, `infer`, self-test. Owns nothing but a position.
 //! * [`ops`]: one operator per file: what its step must satisfy, and how it becomes a call of a kernel.
-//! * [`arena`]: the operands of a step as disjoint slices of one buffer, by checked means only.
+//! * [`arena`]: the operands of a step as disjoint slices of the memory regions, by checked means only.
 //! * [`kernels`]: one method per operator; [`kernels::portable`] is the norm, other backends equal it byte for byte.
 //!   [`kernels::plan`] tells compiler and runtime what a kernel needs. Under the feature `conformance` a sweep proves it.
 //! * [`image`] and [`program`]: the file format, its checks, and the steps. The compiler writes what these define.
+//! * [`update`]: a new image in the field: two slots of a flash, and the start that chooses between them.
 //! * [`sensors`]: camera rows, LiDAR points, speed and goal as the network reads them.
 //! * `ffi`, under the feature of this name: the same for programs in C; the header is `include/firmware.h`.
 //! * [`waypoint`]: the network's result as a controller reads it.
@@ -58,7 +60,9 @@
 #[cfg(not(target_endian = "little"))]
 compile_error!("model images are little-endian and executed in place");
 
+pub mod actuators;
 pub mod arena;
+pub mod computer;
 #[cfg(any(test, feature = "conformance"))]
 pub mod conformance;
 pub mod drive;
@@ -69,8 +73,10 @@ pub mod ffi;
 pub mod fixed_point;
 pub mod image;
 pub mod kernels;
+pub mod link;
 pub mod ops;
 pub mod program;
 pub mod sensors;
 pub mod tensor;
+pub mod update;
 pub mod waypoint;

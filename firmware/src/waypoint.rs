@@ -2,6 +2,7 @@
 
 use fixed::types::I16F16;
 use heapless::Vec;
+use serde::{Deserialize, Serialize};
 
 /// Most waypoints of one output; the published networks give 4.
 pub const MAX_WAYPOINTS: usize = 16;
@@ -10,7 +11,7 @@ pub const MAX_WAYPOINTS: usize = 16;
 pub(crate) const SCALE_BITS: u32 = (1.0_f32 / 65536.0).to_bits();
 
 /// Where to be, half a second after the waypoint before (the first: half a second from now), in the vehicle's frame.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Waypoint {
     /// Meters to the right.
     pub right: I16F16,

@@ -1,5 +1,5 @@
-//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `drive`, `score`, `bench`, `schema`,
-//! `completions`, and the demo without any of them.
+//! The command line: `run`, `verify`, `diff`, `ablate`, `attention`, `drive`, `score`, `bench`,
+//! `footprint`, `schema`, `completions`, and the demo without any of them.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
@@ -12,6 +12,7 @@ use attention::AttentionArgs;
 use bench::BenchArgs;
 use clap::{Args, Parser, Subcommand};
 use diff::DiffArgs;
+use footprint::FootprintArgs;
 use indicatif::ProgressBar;
 use model_compiler::cli::{CompletionArgs, ImportArgs, progress_bar};
 use model_compiler::error::{Error, ErrorCode, Result};
@@ -23,6 +24,7 @@ mod attention;
 mod bench;
 mod diff;
 mod examples;
+mod footprint;
 mod gates;
 mod verify;
 
@@ -154,6 +156,14 @@ enum Command {
         #[command(flatten)]
         common: Common,
     },
+    /// Flash, RAM and stack of a firmware, from its linked ELF.
+    #[command(after_help = examples::FOOTPRINT)]
+    Footprint {
+        #[command(flatten)]
+        footprint: FootprintArgs,
+        #[command(flatten)]
+        common: Common,
+    },
     /// Script that completes commands and options in a shell.
     #[command(after_help = examples::COMPLETIONS)]
     Completions(CompletionArgs),
@@ -246,6 +256,7 @@ impl Command {
             | Self::Ablate { common, .. }
             | Self::Bench { common, .. }
             | Self::Diff { common, .. }
+            | Self::Footprint { common, .. }
             | Self::Attention { common, .. }
             | Self::Drive { common, .. }
             | Self::Score { common, .. }
@@ -285,6 +296,7 @@ impl Command {
                 Ok(0)
             }
             Self::Diff { diff, common } => diff.execute(&common, console),
+            Self::Footprint { footprint, common } => footprint.execute(&common, console),
             Self::Schema { document, .. } => {
                 console.print(&format!("{:#}", json::schema(document)));
                 Ok(0)

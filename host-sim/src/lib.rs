@@ -38,6 +38,7 @@ pub mod demo;
 pub mod diff;
 pub mod drive;
 pub mod files;
+pub mod footprint;
 pub mod gates;
 pub mod histogram;
 pub mod metrics;

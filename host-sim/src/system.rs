@@ -8,16 +8,7 @@ use model_compiler::error::{Error, ErrorCode, Result};
 
 /// The system of a network with inputs of these names; `None` where they are no driving network's.
 pub fn of_inputs(names: &[&str]) -> Option<System> {
-    let reads = |name: &str| names.contains(&name);
-    match (reads("rgb"), reads("bev"), reads("goal")) {
-        _ if reads("views") => Some(System::Lbc),
-        (true, false, false) if reads("command") => Some(System::Cilrs),
-        (true, true, true) if reads("bev_points") => Some(System::GeometricFusion),
-        (true, true, true) if reads("velocity") => Some(System::TransFuser),
-        (true, true, true) => Some(System::LateFusion),
-        (true, false, true) => Some(System::Aim),
-        _ => None,
-    }
+    System::of_inputs(|name| names.contains(&name))
 }
 
 /// Names of an image's inputs.

@@ -12,7 +12,7 @@ use crate::passes::PassOptions;
 use crate::pipeline;
 use crate::qmodel::QModel;
 use crate::quantize::{QuantizeOptions, RangeRule, SkipStages};
-use crate::target::{Target, parse_size};
+use crate::target::{Region, Target, parse_size};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -62,6 +62,9 @@ enum Command {
         quantize: QuantizeArgs,
         #[command(flatten)]
         target: TargetArgs,
+        /// Revision of the model: an update in the field refuses a lower one than it runs.
+        #[arg(long, default_value_t = 0, value_name = "N")]
+        revision: u32,
         #[command(flatten)]
         forms: FormArgs,
         /// Output file; the record gets the same name with the extension .record.
@@ -217,14 +220,24 @@ fn size(text: &str) -> std::result::Result<u64, String> {
     parse_size(text).map_err(|e| format!("{}, {}", e.message, e.help))
 }
 
+/// `NAME=BYTES`; names are judged where the regions meet.
+fn region(text: &str) -> std::result::Result<Region, String> {
+    let (name, bytes) = text.split_once('=').ok_or_else(|| format!("found {text:?}, expected NAME=BYTES"))?;
+    Ok(Region { name: name.into(), bytes: Some(size(bytes)?) })
+}
+
 #[derive(Debug, Args)]
 struct TargetArgs {
     /// Built-in target name, or a .toml file that describes one.
     #[arg(long, default_value = "portable", value_name = "NAME|FILE.toml")]
     target: String,
     /// RAM for the arena: bytes, or with K or M.
-    #[arg(long, value_name = "BYTES", value_parser = size)]
+    #[arg(long, value_name = "BYTES", value_parser = size, conflicts_with = "region")]
     ram: Option<u64>,
+    /// A memory for the arena, instead of the target's: name and bytes (or with K or M). Give up to four, the fastest
+    /// first: the hottest buffers go there.
+    #[arg(long, value_name = "NAME=BYTES", value_parser = region)]
+    region: Vec<Region>,
     /// Flash for the image: bytes, or with K or M.
     #[arg(long, value_name = "BYTES", value_parser = size)]
     flash: Option<u64>,
@@ -296,7 +309,16 @@ impl QuantizeArgs {
 
 impl TargetArgs {
     fn target(&self) -> Result<Target> {
-        Ok(Target::find(&self.target)?.with_limits(self.ram, self.flash))
+        let mut target = Target::find(&self.target)?;
+        if !self.region.is_empty() {
+            target = target.with_regions(self.region.clone())?;
+        }
+        if self.ram.is_some() && target.regions.len() > 1 {
+            let names: Vec<String> = target.regions.iter().map(|r| format!("--region {}=BYTES", r.name)).collect();
+            let message = format!("target {} has {} memories, --ram is the size of one", target.name, names.len());
+            return Err(Error::new(ErrorCode::Usage, "--ram", message).with_help(format!("use {}", names.join(" "))));
+        }
+        Ok(target.with_limits(self.ram, self.flash))
     }
 
     fn plan_options(&self, target: &Target) -> PlanOptions {
@@ -339,8 +361,8 @@ impl Command {
         let done = match self {
             Self::Inspect { file, diff: Some(before), json } => return diff::run(before, file, *json),
             Self::Quantize { model, quantize, output } => run_quantize(model, quantize, output, bar),
-            Self::Compile { model, quantize, target, forms, output } => {
-                run_compile(model, quantize, target, (forms, output), bar, console)
+            Self::Compile { model, quantize, target, revision, forms, output } => {
+                run_compile(model, quantize, target, *revision, (forms, output), bar, console)
             }
             Self::Convert { image, forms, output } => convert::run(image, forms, output),
             Self::Inspect { file, .. } => inspect::inspect(file),
@@ -366,6 +388,7 @@ fn run_compile(
     model: &Path,
     quantize: &QuantizeArgs,
     target: &TargetArgs,
+    revision: u32,
     (forms, output): (&FormArgs, &Path),
     bar: &mut Bar,
     console: &mut Console<'_>,
@@ -391,7 +414,7 @@ fn run_compile(
     };
     let options = target.plan_options(&target_data);
     let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t));
-    let compiled = compiled.map_err(|e| e.within(model.display()))?;
+    let compiled = compiled.and_then(|c| c.with_revision(revision)).map_err(|e| e.within(model.display()))?;
     let files = forms.files(&compiled.image, output)?;
     let others = files.iter().map(|(path, bytes)| (path.as_path(), bytes.as_slice()));
     let others: Vec<_> = others.filter(|(path, _)| *path != image_path).collect();

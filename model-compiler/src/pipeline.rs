@@ -2,7 +2,7 @@
 
 use crate::artifact::{self, hex};
 use crate::calibrate::calibrate;
-use crate::emit::emit;
+use crate::emit::{self, emit};
 use crate::error::{Error, ErrorCode, Result};
 use crate::frames::{self, Frame, FrameFormat};
 use crate::import::{self, ImportOptions};
@@ -85,6 +85,18 @@ pub struct Compiled {
     pub record: Record,
 }
 
+impl Compiled {
+    /// The same with another revision of the model; a fresh image has revision 0.
+    ///
+    /// # Errors
+    /// The image is none.
+    pub fn with_revision(mut self, revision: u32) -> Result<Self> {
+        self.image = emit::with_revision(&self.image, revision)?;
+        self.record.image_sha256 = artifact::sha256(&self.image);
+        Ok(self)
+    }
+}
+
 /// Plans, packs and emits a quantized model for a target.
 ///
 /// # Errors
@@ -98,6 +110,7 @@ pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress:
     })?;
     progress("plan", 1, 1);
     let mut parts = pack(model, &plan)?;
+    parts.target = target.name.clone();
     parts.known_answer = Some(known_answer(model, &plan, |done, total| progress("known answer", done, total))?);
     progress("emit", 0, 1);
     let image = emit(&parts)?;
@@ -137,7 +150,7 @@ pub fn record_path(image_path: &Path) -> std::path::PathBuf {
 pub fn summary(compiled: &Compiled) -> Vec<(String, String)> {
     let (model, plan) = (&compiled.record.model, &compiled.record.plan);
     let weights = model.steps.iter().map(|s| s.op.weight_bytes()).sum::<u64>();
-    vec![
+    let mut facts = vec![
         ("model".into(), format!("{} ({})", model.name, model.system)),
         ("target".into(), compiled.record.target.clone()),
         ("steps".into(), model.steps.len().to_string()),
@@ -154,18 +167,26 @@ pub fn summary(compiled: &Compiled) -> Vec<(String, String)> {
             "arena".into(),
             format!(
                 "{} B ({:.3} MiB), bound {} B: {}",
-                plan.arena_bytes,
-                mib(plan.arena_bytes),
-                plan.bound_bytes,
-                plan.status.words()
+                plan.arena_bytes(),
+                mib(plan.arena_bytes()),
+                plan.bound_bytes(),
+                plan.status().words()
             ),
         ),
-        (
-            "peak".into(),
-            format!("step {} {}", plan.peak_step, model.steps[plan.order[plan.peak_step as usize] as usize].name),
-        ),
-        ("sha256".into(), hex(&compiled.record.image_sha256)),
-    ]
+    ];
+    let step = |position: u32| format!("step {position} {}", model.steps[plan.order[position as usize] as usize].name);
+    match plan.regions.as_slice() {
+        [only] => facts.push(("peak".into(), step(only.peak_step))),
+        parts => facts.extend(parts.iter().map(|part| {
+            let of = part.capacity.map(|capacity| format!(" of {capacity} B")).unwrap_or_default();
+            let share = 100.0 * plan.traffic_share(part);
+            let (bytes, bound, status) = (part.bytes, part.bound_bytes, part.status.words());
+            let text = format!("{bytes} B{of}, bound {bound} B: {status}; {share:.1} % of the traffic");
+            (part.name.clone(), format!("{text}; peak {}", step(part.peak_step)))
+        })),
+    }
+    facts.push(("sha256".into(), hex(&compiled.record.image_sha256)));
+    facts
 }
 
 fn mib(bytes: u64) -> f64 {

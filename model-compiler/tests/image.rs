@@ -3,14 +3,18 @@
 #[path = "support/sample_image.rs"]
 mod sample_image;
 
+use firmware::arena::Regions;
 use firmware::engine::{Engine, EngineError, Progress};
 use firmware::image::audit::{Array, AuditError, audit};
-use firmware::image::{Check, CheckProgress, Checker, Image, SectionKind, TensorRecord, crc32, layout};
+use firmware::image::{
+    Check, CheckProgress, Checker, Image, Region, RegionName, SectionKind, TensorRecord, crc32, layout,
+};
 use firmware::kernels::{Kernels, Portable, k4n16, plan};
 use firmware::program::{Clamp, ConstRange, KernelId, Requant, Requantize, Step};
 use firmware::tensor::{ElementType, Shape, TensorId};
 use model_compiler::emit::{
     AlignedBytes, ConstantsBuilder, ImageParts, ImagePort, KnownAnswer, assemble, emit, reseal, with_known_answer,
+    with_revision,
 };
 use sample_image::{STEPS, at, ids};
 
@@ -39,6 +43,7 @@ fn sample_is_accepted() {
     assert_eq!(image.name(), parts.name);
     assert_eq!(image.qmodel_digest(), parts.qmodel_digest);
     assert_eq!(image.build_digest(), parts.build_digest);
+    assert_eq!((image.target(), image.revision()), (parts.target.as_str(), parts.revision));
     assert_eq!((image.step_count() as usize, image.tensor_count() as usize), (STEPS, parts.tensors.len()));
     for (position, step) in parts.steps.iter().enumerate() {
         assert_eq!(image.step(position as u16).as_ref(), Some(step));
@@ -223,8 +228,8 @@ fn packed_parts() -> ImageParts {
     linear.kernel = KernelId::K4N16;
     linear.weights = ConstRange { offset: parts.constants.len() as u32, bytes: packed.len() as u32 };
     let record = &mut parts.tensors[usize::from(linear.scratch.expect("scratch").0)];
-    (record.offset, record.bytes) = (parts.arena_bytes, scratch);
-    parts.arena_bytes += scratch;
+    (record.offset, record.bytes) = (parts.regions[0].bytes, scratch);
+    parts.regions[0].bytes += scratch;
     parts.constants.extend(packed.iter().map(|weight| weight.cast_unsigned()));
     parts
 }
@@ -272,12 +277,98 @@ fn engine_refuses_a_bad_arena_and_missing_kernels() {
     let needed = image.arena_bytes();
     let mut small = AlignedBytes::zeroed(needed as usize - 1);
     let error = Engine::new(image, Portable, &mut small).expect_err("too small");
-    assert_eq!(error, EngineError::ArenaTooSmall { found: needed - 1, needed });
+    assert_eq!(error, EngineError::ArenaTooSmall { region: RegionName::MAIN, found: needed - 1, needed });
     let mut arena = AlignedBytes::zeroed(needed as usize + 16);
     let error = Engine::new(image, Portable, &mut arena[8..]).expect_err("misaligned");
-    assert_eq!(error, EngineError::ArenaMisaligned { remainder: 8, alignment: 16 });
+    assert_eq!(error, EngineError::ArenaMisaligned { region: RegionName::MAIN, remainder: 8, alignment: 16 });
     let error = Engine::new(image, NoKernels, &mut arena).expect_err("no kernels");
     assert_eq!(error, EngineError::KernelMissing(KernelId::Direct));
+}
+
+/// The sample with its scratch and every third chain of tensors in a region `fast` of the same size, behind `main`.
+fn in_two_regions() -> AlignedBytes {
+    let mut parts = sample_image::parts();
+    let root = |parts: &ImageParts, mut id: u16| {
+        while let Some(operand) = parts.tensors[usize::from(id)].in_place_of {
+            id = operand.0;
+        }
+        id
+    };
+    for id in 0..parts.tensors.len() as u16 {
+        let fast = parts.tensors[usize::from(id)].element == ElementType::Scratch || root(&parts, id) % 3 == 0;
+        parts.tensors[usize::from(id)].region = u8::from(fast);
+    }
+    let fast = RegionName::new("fast").expect("a name");
+    parts.regions.push(Region { name: fast, alignment: 64, ..parts.regions[0] });
+    AlignedBytes::from(emit(&parts).expect("the sample in two regions").as_slice())
+}
+
+#[test]
+fn engine_names_the_region_that_is_wrong() {
+    let bytes = in_two_regions();
+    let image = Image::parse(&bytes).expect("parses");
+    let [main, fast] = [0, 1].map(|region| image.region(region).expect("two regions"));
+    assert_eq!((image.region(2), image.region_count(), image.arena_alignment()), (None, 2, 64));
+    let needed = main.bytes as usize;
+    assert_eq!(image.arena_bytes(), 2 * main.bytes);
+    let mut memory = AlignedBytes::zeroed(3 * needed + 256);
+    let start = memory.as_ptr().align_offset(64);
+    let (a, rest) = memory[start..].split_at_mut(needed.next_multiple_of(64));
+    let (b, c) = rest.split_at_mut(needed.next_multiple_of(64));
+    fn refused(error: EngineError, words: &str, found: Result<Engine<'_, Portable>, EngineError>) {
+        assert_eq!(found.map(drop), Err(error));
+        assert_eq!(error.to_string(), words);
+    }
+    let missing = EngineError::RegionMissing(fast.name);
+    refused(missing, "arena fast: no buffer was given", Engine::new(image, Portable, &mut *a));
+    let surplus = EngineError::RegionCount { found: 3, expected: 2 };
+    let words = "3 buffers given, the image has 2 memory regions";
+    refused(surplus, words, Engine::new(image, Portable, [&mut *a, &mut *b, &mut *c]));
+    let small = EngineError::ArenaTooSmall { region: fast.name, found: main.bytes - 1, needed: main.bytes };
+    let words = format!("arena fast: {} bytes, the image needs {needed}", needed - 1);
+    refused(small, &words, Engine::new(image, Portable, [&mut *a, &mut b[..needed - 1]]));
+    let misaligned = EngineError::ArenaMisaligned { region: fast.name, remainder: 16, alignment: 64 };
+    let words = "arena fast: starts 16 bytes behind a multiple of 64";
+    refused(misaligned, words, Engine::new(image, Portable, [&mut *a, &mut b[16..]]));
+    Engine::new(image, Portable, [a, b]).expect("both fit");
+}
+
+#[test]
+fn two_regions_give_the_bytes_of_one() {
+    let run = |bytes: &AlignedBytes| {
+        let image = Image::parse(bytes).expect("parses");
+        let given = inputs(&image, 11);
+        let slices: Vec<&[u8]> = given.iter().map(Vec::as_slice).collect();
+        let mut memory: Vec<AlignedBytes> =
+            image.regions().map(|region| AlignedBytes::zeroed((region.bytes + region.alignment) as usize)).collect();
+        let aligned = image.regions().zip(&mut memory).map(|(region, buffer)| {
+            let start = buffer.as_ptr().align_offset(region.alignment as usize);
+            &mut buffer[start..]
+        });
+        let mut engine = Engine::new(image, Portable, aligned.collect::<Regions<'_>>()).expect("fits");
+        let mut steps = Vec::new();
+        engine.infer_observed(&slices, |_, _, bytes| steps.push(bytes.to_vec())).expect("runs");
+        let outputs = (0..image.output_count()).map(|i| engine.output(i.into()).expect("done").to_vec());
+        steps.extend(outputs);
+        steps
+    };
+    assert_eq!(run(&in_two_regions()), run(&sample()));
+}
+
+#[test]
+fn audit_sees_an_overlap_within_a_region_only() {
+    let mut parts = sample_image::parts();
+    parts.regions.push(Region { name: RegionName::new("fast").expect("a name"), ..parts.regions[0] });
+    // All scratch at the start of the other region: each is live in its own step.
+    for scratch in parts.tensors.iter_mut().filter(|tensor| tensor.element == ElementType::Scratch) {
+        (scratch.region, scratch.offset) = (1, 0);
+    }
+    emit(&parts).expect("nothing overlaps there");
+    for scratch in parts.tensors.iter_mut().filter(|tensor| tensor.element == ElementType::Scratch) {
+        scratch.region = 0;
+    }
+    let error = emit(&parts).expect_err("overlap");
+    assert!(error.message.contains("holds another live tensor"), "{error}");
 }
 
 /// Inputs of the sample from one seed.
@@ -382,7 +473,7 @@ fn bytes_of_dead_tensors_do_not_matter() {
         for position in 0..STEPS as u16 {
             let kept: Vec<_> =
                 records.iter().filter(|r| r.first_step < position.max(1) && r.is_live(position)).collect();
-            for (at, byte) in engine.arena_mut().iter_mut().enumerate() {
+            for (at, byte) in engine.regions_mut().flatten().enumerate() {
                 if !kept.iter().any(|r| (u64::from(r.offset)..r.end()).contains(&(at as u64))) {
                     *byte = poison;
                 }
@@ -478,9 +569,20 @@ fn parts_that_do_not_fit_are_refused_by_name() {
     parts.inputs[1].name = "n".repeat(25);
     assert!(assemble(&parts).expect_err("port").message.contains("24 bytes"));
     parts = sample_image::parts();
-    parts.arena_bytes -= 16;
+    parts.target = "t".repeat(17);
+    assert!(assemble(&parts).expect_err("target").message.contains("16 bytes"));
+    parts = sample_image::parts();
+    parts.regions[0].bytes -= 16;
     let error = emit(&parts).expect_err("arena");
-    assert!(error.message.contains("outside the arena"), "{error}");
+    assert!(error.message.contains("outside its memory region"), "{error}");
+}
+
+#[test]
+fn another_revision_changes_nothing_else() {
+    let old = emit(&sample_image::parts()).expect("valid");
+    let new = with_revision(&old, 4).expect("an image");
+    assert_eq!(new, emit(&ImageParts { revision: 4, ..sample_image::parts() }).expect("valid"));
+    assert!(with_revision(&old[..64], 4).is_err());
 }
 
 /// The image of the format page.
@@ -488,6 +590,7 @@ fn page_example() -> ImageParts {
     let tensor = |offset, first_step| TensorRecord {
         element: ElementType::I8,
         shape: Shape::vector(16),
+        region: 0,
         offset,
         bytes: 16,
         first_step,
@@ -509,8 +612,9 @@ fn page_example() -> ImageParts {
         constants: vec![],
         inputs: vec![port("x", 0)],
         outputs: vec![port("y", 1)],
-        arena_bytes: 32,
-        arena_alignment: 16,
+        regions: vec![Region { name: RegionName::MAIN, bytes: 32, alignment: 16 }],
+        target: String::new(),
+        revision: 0,
         qmodel_digest: [0; 32],
         build_digest: [0; 32],
         known_answer: None,

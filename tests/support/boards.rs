@@ -16,6 +16,8 @@ pub struct Board {
     machine: &'static [&'static str],
     /// Where the program looks for the image.
     image_address: u32,
+    /// By how much two equal counts of instructions may differ: the counter's tick may be no divisor of 64 ns.
+    pub counter_resolution: u64,
 }
 
 /// Every board.
@@ -26,6 +28,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps2-an386"],
         image_address: 0x2100_0000,
+        counter_resolution: 1,
     },
     Board {
         name: "an500",
@@ -33,6 +36,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps2-an500"],
         image_address: 0x6000_0000,
+        counter_resolution: 1,
     },
     Board {
         name: "an547",
@@ -40,6 +44,7 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-arm",
         machine: &["mps3-an547"],
         image_address: 0x6000_0000,
+        counter_resolution: 0,
     },
     Board {
         name: "virt",
@@ -47,11 +52,20 @@ pub const ALL: [Board; 4] = [
         emulator: "qemu-system-aarch64",
         machine: &["virt", "-cpu", "cortex-a72", "-m", "512M", "-nic", "none"],
         image_address: 0x5000_0000,
+        counter_resolution: 0,
     },
 ];
 
-/// The program in C (`firmware/boards/c`), which runs on the first board.
-pub const IN_C: Board = Board { name: "an386-c", ..ALL[0] };
+/// A board's binaries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Program {
+    /// The product.
+    Drive,
+    /// Checks for bench and test.
+    Check,
+    /// The one in C (`firmware/boards/c`), of the first board alone.
+    InC,
+}
 
 /// What a run gave.
 #[derive(Clone, Debug)]
@@ -63,32 +77,48 @@ pub struct Run {
 }
 
 impl Board {
-    /// Runs the board's program over an image; `None` where the program or the emulator is missing, which is said past
-    /// the test's capture.
+    /// Runs the self-test over an image; `None` as of [`Self::check`].
+    ///
+    /// # Panics
+    /// As [`Self::check`].
+    pub fn run(&self, image: &[u8]) -> Option<Run> {
+        self.check("self-test", image)
+    }
+
+    /// Runs a check over an image and what lies behind it; `None` where the program or the emulator is missing, which
+    /// is said past the test's capture.
     ///
     /// # Panics
     /// The image cannot be written or the emulator not started.
-    pub fn run(&self, image: &[u8]) -> Option<Run> {
-        let program = self.built_program()?;
+    pub fn check(&self, check: &str, memory: &[u8]) -> Option<Run> {
+        self.run_program(Program::Check, check, memory)
+    }
+
+    /// Runs a program with a command line; as [`Self::check`].
+    ///
+    /// # Panics
+    /// As [`Self::check`].
+    pub fn run_program(&self, program: Program, command_line: &str, memory: &[u8]) -> Option<Run> {
+        let program = self.built_program(program)?;
         let folder = tempfile::tempdir().expect("a temporary folder");
         let file = folder.path().join("model.img");
-        fs::write(&file, image).expect("the image");
+        fs::write(&file, memory).expect("the image");
         let output = Command::new(self.emulator)
             .arg("-M")
             .args(self.machine)
             .args(["-display", "none", "-monitor", "none", "-serial", "stdio", "-icount", "shift=6"])
             .args(["-semihosting-config", "enable=on,target=native", "-device"])
             .arg(format!("loader,file={},addr={:#x},force-raw=on", file.display(), self.image_address))
-            .arg("-kernel")
+            .args(["-append", command_line, "-kernel"])
             .arg(program)
             .output()
             .unwrap_or_else(|e| panic!("{}: {e}", self.emulator));
         Some(Run { status: output.status.code(), console: String::from_utf8_lossy(&output.stdout).into_owned() })
     }
 
-    /// The board's program; `None` where it or the emulator is missing, which is said past the test's capture.
-    pub fn built_program(&self) -> Option<PathBuf> {
-        let program = self.program();
+    /// A program of the board; `None` where it or the emulator is missing, which is said past the test's capture.
+    pub fn built_program(&self, program: Program) -> Option<PathBuf> {
+        let program = self.program(program);
         if program.exists() && is_installed(self.emulator) {
             return Some(program);
         }
@@ -102,9 +132,15 @@ impl Board {
         None
     }
 
-    fn program(&self) -> PathBuf {
+    /// Where `tests/run` puts the ELF of a program.
+    pub fn program(&self, program: Program) -> PathBuf {
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-        root.join("target/mcu").join(self.triple).join("release").join(self.name)
+        let name = match program {
+            Program::Drive => format!("{}-drive", self.name),
+            Program::Check => format!("{}-check", self.name),
+            Program::InC => format!("{}-c", self.name),
+        };
+        root.join("target/mcu").join(self.triple).join("release").join(name)
     }
 }
 

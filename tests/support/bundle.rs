@@ -6,9 +6,13 @@
 
 use crate::golden::{self, Network};
 use model_compiler::error::Result;
-use model_compiler::frames::Frame;
+use model_compiler::frames::{self, Frame, FrameFormat};
 use model_compiler::import::{ImportOptions, NamedTensors, System, TensorData, import};
-use model_compiler::pipeline;
+use model_compiler::memory_plan::PlanOptions;
+use model_compiler::passes::PassOptions;
+use model_compiler::pipeline::{self, Compiled};
+use model_compiler::quantize::QuantizeOptions;
+use model_compiler::target::Target;
 use std::fs;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -72,6 +76,22 @@ pub fn checkpoint_path() -> PathBuf {
 /// The stored frames of a set: `calibration` or `evaluation`.
 pub fn frames_path(set: &str) -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("host-sim/frames").join(set)
+}
+
+/// The stored checkpoint, compiled for a microcontroller.
+///
+/// # Panics
+/// It is refused.
+pub fn for_microcontroller() -> Compiled {
+    let compile = || {
+        let (import, passes) = (ImportOptions::default(), PassOptions::default());
+        let graph = pipeline::load_graph(&checkpoint_path(), &import, &passes)?;
+        let frames = frames::load(&frames_path("calibration"), &FrameFormat::of_graph(&graph))?;
+        let model = pipeline::quantize_graph(&graph, &frames, &QuantizeOptions::default(), &mut |_, _, _| {})?;
+        let target = Target::find("cortex-m4")?;
+        pipeline::compile(&model, &target, &PlanOptions::for_target(&target), &mut |_, _, _| {})
+    };
+    compile().unwrap_or_else(|e| panic!("{e}"))
 }
 
 /// Writes checkpoint and frames to their places.

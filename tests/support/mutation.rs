@@ -96,6 +96,9 @@ fn visit_header(image: &[u8], visit: VisitOwned<'_>) {
         ("arena alignment".to_owned(), in_slot(header::REGIONS.start, region::ALIGNMENT)),
         ("second region".to_owned(), header::REGIONS.end - 4..header::REGIONS.end),
         ("last section".to_owned(), header::SECTIONS.end - 4..header::SECTIONS.end),
+        ("target".to_owned(), header::TARGET.start..header::TARGET.start + 1),
+        ("target end".to_owned(), header::TARGET.end - 1..header::TARGET.end),
+        ("revision".to_owned(), header::REVISION),
         ("reserved B".to_owned(), header::RESERVED_B.start..header::RESERVED_B.start + 4),
     ];
     for kind in SectionKind::ALL {
@@ -182,8 +185,8 @@ fn visit_tensors(parts: &ImageParts, visit: Visit<'_>) {
             change(record);
             let bytes = record.shape.elements() * u64::from(record.element.bytes());
             record.bytes = if record.element == ElementType::Scratch { 64 } else { bytes as u32 };
-            record.offset = parts.arena_bytes.next_multiple_of(16);
-            parts.arena_bytes = record.offset.saturating_add(record.bytes).saturating_add(64);
+            record.offset = parts.regions[0].bytes.next_multiple_of(16);
+            parts.regions[0].bytes = record.offset.saturating_add(record.bytes).saturating_add(64);
             visit_parts(&format!("tensor {number} moved, {what}"), &parts, visit);
         };
         for element in [ElementType::I8, ElementType::I16, ElementType::I32, ElementType::Scratch] {

@@ -2,7 +2,7 @@
 //! that they stand for, but are straight lines: a backend must read them, not know them.
 
 use super::draw::Draw;
-use super::{Case, Difference, Outcome, first_difference};
+use super::{Case, Outcome};
 use crate::fixed_point::{EXP_TABLE_LEN, TANH_TABLE_LEN};
 use crate::kernels::{
     AttentionArgs, Kernels, LayerNormArgs, Portable, SigmoidArgs, SoftmaxArgs, SpatialSoftmaxArgs, TokenSourceArgs,
@@ -170,8 +170,7 @@ pub(super) fn spatial_softmax(case: &mut Case<'_>, number: u32) -> Outcome {
     let points = 2 * usize::from(channels);
     Portable.spatial_softmax(&args, logits, expected.get_mut(..points)?);
     case.kernels.spatial_softmax(&args, logits, found.get_mut(..points)?);
-    let difference: Option<Difference> = first_difference(&found, &expected, points);
-    Some(difference.map_or(Ok(points), Err))
+    case.judge(&found, &expected, points)
 }
 
 /// Both forms of the goal.
@@ -207,6 +206,5 @@ pub(super) fn waypoint_decoder(case: &mut Case<'_>, number: u32) -> Outcome {
     let (mut expected, mut found) = ([0x5555; 8], [0x5555; 8]);
     Portable.waypoint_decoder(&args, hidden, goal, &mut expected, scratch);
     case.kernels.waypoint_decoder(&args, hidden, goal, &mut found, scratch);
-    let difference: Option<Difference> = first_difference(&found, &expected, expected.len());
-    Some(difference.map_or(Ok(expected.len()), Err))
+    case.judge(&found, &expected, expected.len())
 }

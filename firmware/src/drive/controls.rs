@@ -1,9 +1,10 @@
 //! What the actuators are told.
 
 use super::Real;
+use serde::{Deserialize, Serialize};
 
 /// One command to the vehicle.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Controls {
     /// −1 (full left) to 1 (full right).

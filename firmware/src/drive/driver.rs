@@ -11,9 +11,10 @@ use super::supervision::{Counters, Fault, Limits, Reading, Sensor, Status, Super
 use super::{DEFAULT_ROUTE, Real};
 use crate::waypoint::Waypoint;
 use fixed::types::{I8F8, I16F16};
+use serde::{Deserialize, Serialize};
 
 /// What the sensors say in one step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Measurements {
     /// Whether there is an image; its pixels go to the network's input. [`Camera::finish`] says it of each camera
@@ -37,7 +38,7 @@ pub struct Measurements {
 }
 
 /// Inputs of the network that do not come from camera and LiDAR, as its input tensors hold them.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct NetworkInputs {
     /// The next node of the route in the vehicle's frame, meters: `[right, −forward]`. Without meaning for a system
@@ -241,6 +242,12 @@ impl<const N: usize> Driver<N> {
         self.counters.skipped = self.counters.skipped.saturating_add(1);
         self.schedule.advance();
         self.plan = None;
+    }
+
+    /// Enters the safe state between two steps, for a fault that is no step's: nothing was received in time, or the
+    /// background self-test failed. The schedule stays where it is.
+    pub fn halt(&mut self, fault: Fault) -> Output {
+        self.stop(fault)
     }
 
     /// Checks the measurements and follows the route: inputs of the network and the speed.

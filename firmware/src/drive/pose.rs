@@ -4,9 +4,10 @@ use super::Real;
 use super::trigonometry::{hypot, sin_cos};
 use crate::waypoint::Waypoint;
 use fixed::types::{I8F8, I16F16};
+use serde::{Deserialize, Serialize};
 
 /// A place on the map, in meters.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Position {
     /// Meters to the north of the origin.

@@ -49,6 +49,19 @@ pub struct Profile {
 }
 
 impl System {
+    /// The system of a network by the names of its inputs; `None` where they are no driving network's.
+    pub fn of_inputs(reads: impl Fn(&str) -> bool) -> Option<Self> {
+        match (reads("rgb"), reads("bev"), reads("goal")) {
+            _ if reads("views") => Some(Self::Lbc),
+            (true, false, false) if reads("command") => Some(Self::Cilrs),
+            (true, true, true) if reads("bev_points") => Some(Self::GeometricFusion),
+            (true, true, true) if reads("velocity") => Some(Self::TransFuser),
+            (true, true, true) => Some(Self::LateFusion),
+            (true, false, true) => Some(Self::Aim),
+            _ => None,
+        }
+    }
+
     /// The system as published. The authors' TransFuser agent alone has a substitute for a compass that is not a
     /// number; their other agents would pass the NaN on to the network.
     pub const fn profile(self) -> Profile {

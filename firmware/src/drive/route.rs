@@ -4,9 +4,10 @@ use super::Real;
 use super::pose::Position;
 use core::fmt;
 use heapless::Deque;
+use serde::{Deserialize, Serialize};
 
 /// What the navigation asks for at a node of the route; the numbers are those of the simulator and of the networks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[repr(u8)]
 pub enum Command {
@@ -41,7 +42,7 @@ impl Command {
 }
 
 /// One node of the route.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct RouteNode {
     /// Where it is.

@@ -3,9 +3,10 @@
 use super::Real;
 use super::schedule::STEP_MS;
 use core::fmt;
+use serde::{Deserialize, Serialize};
 
 /// One measurement as it reaches a step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Reading<T> {
     /// The sensor has said nothing yet, or no longer answers.
@@ -42,7 +43,7 @@ impl<T> Reading<T> {
 }
 
 /// What is supervised.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[repr(u8)]
 pub enum Sensor {
@@ -71,7 +72,7 @@ impl fmt::Display for Sensor {
 }
 
 /// Why the vehicle is not driven.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Fault {
     /// A sensor that the network needs says nothing.
@@ -90,6 +91,8 @@ pub enum Fault {
     NetworkFailed,
     /// The network's output is no possible plan: too few waypoints, too far ones, points above the horizon.
     InvalidOutput,
+    /// Nothing came in time: the link or whoever feeds it is silent.
+    Silence,
 }
 
 impl Fault {
@@ -104,6 +107,7 @@ impl Fault {
             Self::NetworkFailed => 0x60,
             Self::InvalidOutput => 0x70,
             Self::Frozen(sensor) => 0x80 | sensor as u8,
+            Self::Silence => 0x90,
         }
     }
 }
@@ -119,12 +123,13 @@ impl fmt::Display for Fault {
             Self::NetworkOverrun => f.write_str("network not done in its step"),
             Self::NetworkFailed => f.write_str("network failed"),
             Self::InvalidOutput => f.write_str("network output invalid"),
+            Self::Silence => f.write_str("nothing received in time"),
         }
     }
 }
 
 /// What the controls of a step are.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Status {
     /// The controller's answer to the network.
@@ -212,7 +217,7 @@ const FAST_MS: u16 = 2 * STEP_MS;
 const SLOW_MS: u16 = 4 * STEP_MS;
 
 /// How often what happened, since the start; the counts stop at their largest value.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub struct Counters {
     /// Steps.
@@ -241,6 +246,8 @@ pub struct Counters {
     pub network_failures: u32,
     /// [`Fault::InvalidOutput`].
     pub invalid_outputs: u32,
+    /// [`Fault::Silence`].
+    pub silences: u32,
 }
 
 impl Counters {
@@ -255,6 +262,7 @@ impl Counters {
             Fault::NetworkOverrun => &mut self.overruns,
             Fault::NetworkFailed => &mut self.network_failures,
             Fault::InvalidOutput => &mut self.invalid_outputs,
+            Fault::Silence => &mut self.silences,
         };
         *counter = counter.saturating_add(1);
     }

@@ -7,6 +7,9 @@ use core::slice;
 /// First byte and number of bytes of some memory.
 pub(super) type Place = (*const u8, usize);
 
+/// No bytes: overlaps nothing.
+pub(super) const NOWHERE: Place = (core::ptr::null(), 0);
+
 /// Whether two places share a byte.
 pub(super) fn overlap((a, a_bytes): Place, (b, b_bytes): Place) -> bool {
     let (a, b) = (a.addr(), b.addr());

@@ -129,6 +129,7 @@ impl From<CheckError> for Status {
 impl From<EngineError> for Status {
     fn from(error: EngineError) -> Self {
         match error {
+            EngineError::RegionMissing(_) | EngineError::RegionCount { .. } => Self::RegionCount,
             EngineError::ArenaTooSmall { .. } => Self::RegionTooSmall,
             EngineError::ArenaMisaligned { .. } => Self::Misaligned,
             EngineError::KernelMissing(_) => Self::KernelMissing,

@@ -141,7 +141,9 @@ pub struct WaypointQ16 {
 impl From<&Image<'_>> for ImageInfo {
     fn from(image: &Image<'_>) -> Self {
         let mut regions = [RegionNeed::default(); MAX_REGIONS];
-        regions[0] = RegionNeed { bytes: image.arena_bytes(), alignment: image.arena_alignment() };
+        for (need, region) in regions.iter_mut().zip(image.regions()) {
+            *need = RegionNeed { bytes: region.bytes, alignment: region.alignment };
+        }
         Self {
             name: text(image.name()),
             model_digest: image.qmodel_digest(),
@@ -150,7 +152,7 @@ impl From<&Image<'_>> for ImageInfo {
             steps: image.step_count().into(),
             inputs: image.input_count().into(),
             outputs: image.output_count().into(),
-            region_count: 1,
+            region_count: image.region_count().into(),
             regions,
         }
     }

@@ -1,14 +1,22 @@
 //! All bytes of an image against its CRCs, in slices as small as the caller's time allows.
 
-use super::{Image, SectionKind};
+use super::{Image, Section, SectionKind, layout};
 use core::fmt;
-use crc::{CRC_32_ISO_HDLC, Crc, Digest, Table};
+use crc::{CRC_32_ISO_HDLC, Crc, Table};
 
 static CRC: Crc<u32, Table<1>> = Crc::<u32, Table<1>>::new(&CRC_32_ISO_HDLC);
 
 /// CRC-32 (ISO-HDLC, the one of zip and Ethernet) of some bytes.
 pub fn crc32(bytes: &[u8]) -> u32 {
     CRC.checksum(bytes)
+}
+
+/// [`crc32`] of bytes that come in parts.
+pub(crate) type Digest = crc::Digest<'static, u32, Table<1>>;
+
+/// Of no bytes yet.
+pub(crate) fn digest() -> Digest {
+    CRC.digest()
 }
 
 /// A section is damaged.
@@ -46,25 +54,16 @@ pub enum CheckProgress {
 }
 
 /// A check under way; see [`Image::check`] for the whole in one call.
+#[derive(Debug)]
 pub struct Checker<'a> {
-    image: Image<'a>,
-    section: usize,
-    /// Bytes of the current section that are read.
-    position: usize,
-    digest: Digest<'static, u32, Table<1>>,
-    checked: u32,
-}
-
-impl fmt::Debug for Checker<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Checker").field("section", &self.section).field("position", &self.position).finish()
-    }
+    bytes: &'a [u8],
+    cursor: Cursor,
 }
 
 impl<'a> Checker<'a> {
     /// Begins with the first section (the header's own CRC is checked by `parse`).
     pub fn new(image: &Image<'a>) -> Self {
-        Self { image: *image, section: 0, position: 0, digest: CRC.digest(), checked: 0 }
+        Self { bytes: image.bytes, cursor: Cursor::new(image) }
     }
 
     /// Reads at most `max_bytes` more bytes (at least 1).
@@ -72,10 +71,36 @@ impl<'a> Checker<'a> {
     /// # Errors
     /// The first section that is damaged; calling on after that starts with the next section.
     pub fn advance(&mut self, max_bytes: usize) -> Result<CheckProgress, CheckError> {
+        self.cursor.advance(self.bytes, max_bytes)
+    }
+}
+
+/// Where a check stands, without the image, so that it can wait while the flash is used for something else.
+pub(crate) struct Cursor {
+    sections: [Section; layout::SECTIONS],
+    section: usize,
+    /// Bytes of the current section that are read.
+    position: usize,
+    digest: Digest,
+    checked: u32,
+}
+
+impl fmt::Debug for Cursor {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Cursor").field("section", &self.section).field("position", &self.position).finish()
+    }
+}
+
+impl Cursor {
+    pub(crate) fn new(image: &Image<'_>) -> Self {
+        Self { sections: image.sections, section: 0, position: 0, digest: digest(), checked: 0 }
+    }
+
+    /// Reads on in `bytes`, the whole image.
+    pub(crate) fn advance(&mut self, bytes: &[u8], max_bytes: usize) -> Result<CheckProgress, CheckError> {
         let mut budget = max_bytes.max(1);
-        while let Some(kind) = SectionKind::ALL.get(self.section).copied() {
-            let section = self.image.padded_section(kind);
-            let rest = section.get(self.position..).unwrap_or_default();
+        while let Some((kind, section)) = SectionKind::ALL.into_iter().zip(self.sections).nth(self.section) {
+            let rest = section.padded(bytes).get(self.position..).unwrap_or_default();
             let slice = rest.get(..budget.min(rest.len())).unwrap_or_default();
             self.digest.update(slice);
             self.position = self.position.saturating_add(slice.len());
@@ -84,16 +109,15 @@ impl<'a> Checker<'a> {
             if slice.len() < rest.len() {
                 return Ok(CheckProgress::Running { checked: self.checked });
             }
-            self.finish_section(kind)?;
+            self.finish_section(kind, section.crc)?;
         }
         Ok(CheckProgress::Done)
     }
 
-    fn finish_section(&mut self, section: SectionKind) -> Result<(), CheckError> {
-        let found = core::mem::replace(&mut self.digest, CRC.digest()).finalize();
+    fn finish_section(&mut self, section: SectionKind, expected: u32) -> Result<(), CheckError> {
+        let found = core::mem::replace(&mut self.digest, digest()).finalize();
         self.section = self.section.saturating_add(1);
         self.position = 0;
-        let expected = self.image.section_crc(section);
         if found == expected { Ok(()) } else { Err(CheckError { section, found, expected }) }
     }
 }

@@ -33,6 +33,7 @@ use super::InputSize;
 use crate::drive::Reading;
 use crate::tensor::Shape;
 use core::fmt;
+use serde::{Deserialize, Serialize};
 
 mod capture;
 mod format;
@@ -47,7 +48,7 @@ pub use format::{PixelFormat, YuvRange};
 ///
 /// Otherwise a component of a pixel is `R(Σ, 2k)` over the `2^k × 2^k` pixels that it covers, ties up; of YUV formats
 /// Y, U and V are averaged before they become RGB. Rows and columns beyond the last whole pixel are left out.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Scale {
     /// 1:1.
@@ -124,7 +125,7 @@ impl CameraLayout {
         }
     }
 
-    fn check(&self) -> Result<(), LayoutError> {
+    pub(crate) fn check(&self) -> Result<(), LayoutError> {
         let (found, map) = ([self.width, self.height], self.map);
         let needed = [map.width, map.height].map(|side| u32::from(side) << self.scale.bits());
         if needed.into_iter().zip(found).any(|(needed, found)| needed == 0 || needed > u32::from(found)) {

@@ -108,33 +108,36 @@ pub struct Statistics {
 }
 
 /// Lists that grow point by point in the network's inputs.
-#[derive(Debug)]
-pub struct Correspondences<'a> {
+#[derive(Clone, Copy, Debug)]
+pub struct Correspondences {
     intrinsics: Intrinsics,
-    bev: CellLists<'a>,
-    camera: CellLists<'a>,
+    bev: Lengths,
+    camera: Lengths,
     statistics: Statistics,
 }
 
-impl<'a> Correspondences<'a> {
-    /// Begins with all entries (0, 0); both inputs are `[8][8][5][2]`.
+impl Correspondences {
+    /// Lists before their first point; [`Self::start`] comes first.
+    pub const fn new(intrinsics: Intrinsics) -> Self {
+        let statistics = Statistics { points: 0, not_finite: 0, out_of_view: 0, surplus: 0 };
+        Self { intrinsics, bev: Lengths::NONE, camera: Lengths::NONE, statistics }
+    }
+
+    /// Begins anew, with all entries (0, 0); both inputs are `[8][8][5][2]`.
     ///
     /// # Errors
     /// An input has another size.
-    pub fn new(intrinsics: Intrinsics, bev_points: &'a mut [i8], cam_points: &'a mut [i8]) -> Result<Self, InputSize> {
-        let (bev, camera) = (CellLists::new(bev_points)?, CellLists::new(cam_points)?);
-        Ok(Self { intrinsics, bev, camera, statistics: Statistics::default() })
+    pub fn start(&mut self, bev_points: &mut [i8], cam_points: &mut [i8]) -> Result<(), InputSize> {
+        InputSize::check(bev_points.len(), ELEMENTS as u64)?;
+        InputSize::check(cam_points.len(), ELEMENTS as u64)?;
+        bev_points.fill(0);
+        cam_points.fill(0);
+        *self = Self::new(self.intrinsics);
+        Ok(())
     }
 
-    /// Begins anew.
-    pub fn clear(&mut self) {
-        self.bev.clear();
-        self.camera.clear();
-        self.statistics = Statistics::default();
-    }
-
-    /// Takes a point, or that it is none.
-    pub fn push(&mut self, point: Result<Point, NotFinite>) {
+    /// Takes a point, or that it is none, into the inputs that were given to [`Self::start`].
+    pub fn push(&mut self, point: Result<Point, NotFinite>, bev_points: &mut [i8], cam_points: &mut [i8]) {
         let Statistics { points, not_finite, out_of_view, surplus } = &mut self.statistics;
         *points = points.saturating_add(1);
         let Ok(Point { left, forward, .. }) = point else {
@@ -148,42 +151,29 @@ impl<'a> Correspondences<'a> {
             return;
         };
         // Both, whatever the first one says.
-        if !(self.bev.push(ground, image) | self.camera.push(image, ground)) {
+        if !(self.bev.push(bev_points, ground, image) | self.camera.push(cam_points, image, ground)) {
             *surplus = surplus.saturating_add(1);
         }
     }
 
     /// Ends the lists.
-    pub fn finish(self) -> Statistics {
-        self.statistics
+    pub fn finish(&mut self) -> Statistics {
+        core::mem::take(&mut self.statistics)
     }
 }
 
-/// The entries of each cell of one view.
-#[derive(Debug)]
-struct CellLists<'a> {
-    entries: &'a mut [[[i8; 2]; ENTRIES]],
-    lengths: [u8; CELLS * CELLS],
-}
+/// How many entries each cell of a view has.
+#[derive(Clone, Copy, Debug)]
+struct Lengths([u8; CELLS * CELLS]);
 
-impl<'a> CellLists<'a> {
-    fn new(input: &'a mut [i8]) -> Result<Self, InputSize> {
-        InputSize::check(input.len(), ELEMENTS as u64)?;
-        let (entries, _) = input.as_chunks_mut::<2>().0.as_chunks_mut::<ENTRIES>();
-        let mut lists = Self { entries, lengths: [0; CELLS * CELLS] };
-        lists.clear();
-        Ok(lists)
-    }
-
-    fn clear(&mut self) {
-        self.entries.fill([[0; 2]; ENTRIES]);
-        self.lengths = [0; CELLS * CELLS];
-    }
+impl Lengths {
+    const NONE: Self = Self([0; CELLS * CELLS]);
 
     /// Adds an entry to a cell, if it has one free.
-    fn push(&mut self, [i, j]: [u8; 2], entry: [u8; 2]) -> bool {
+    fn push(&mut self, input: &mut [i8], [i, j]: [u8; 2], entry: [u8; 2]) -> bool {
+        let (entries, _) = input.as_chunks_mut::<2>().0.as_chunks_mut::<ENTRIES>();
         let cell = usize::from(i.wrapping_mul(8).wrapping_add(j));
-        let Some((list, length)) = self.entries.get_mut(cell).zip(self.lengths.get_mut(cell)) else { return false };
+        let Some((list, length)) = entries.get_mut(cell).zip(self.0.get_mut(cell)) else { return false };
         let Some(free) = list.get_mut(usize::from(*length)) else { return false };
         *free = entry.map(u8::cast_signed);
         *length = length.saturating_add(1);
@@ -268,14 +258,15 @@ mod tests {
     #[test]
     fn the_first_five_points_of_a_cell_stay() {
         let (mut bev, mut camera) = ([9; ELEMENTS], [9; ELEMENTS]);
-        let mut lists = Correspondences::new(Intrinsics::PUBLISHED, &mut bev, &mut camera).unwrap();
+        let mut lists = Correspondences::new(Intrinsics::PUBLISHED);
+        lists.start(&mut bev, &mut camera).unwrap();
         let place = |left: f32, forward: f32| Mounting::TRAINED.place([left, forward, 0.0].map(f32::to_bits));
-        lists.push(place(1.0, 11.0));
-        (0..5).for_each(|_| lists.push(place(2.0, 10.0)));
-        lists.push(place(-2.0, 10.0));
-        lists.push(place(2.0, 10.0));
-        lists.push(place(0.0, -1.0));
-        lists.push(place(f32::NAN, 1.0));
+        lists.push(place(1.0, 11.0), &mut bev, &mut camera);
+        (0..5).for_each(|_| lists.push(place(2.0, 10.0), &mut bev, &mut camera));
+        lists.push(place(-2.0, 10.0), &mut bev, &mut camera);
+        lists.push(place(2.0, 10.0), &mut bev, &mut camera);
+        lists.push(place(0.0, -1.0), &mut bev, &mut camera);
+        lists.push(place(f32::NAN, 1.0), &mut bev, &mut camera);
         let statistics = lists.finish();
         assert_eq!(statistics, Statistics { points: 10, not_finite: 1, out_of_view: 1, surplus: 1 });
         let list = |input: &[i8; ELEMENTS], i: usize, j: usize| input[(i * 8 + j) * 10..][..10].to_vec();
@@ -284,9 +275,10 @@ mod tests {
         assert_eq!(list(&camera, 4, 5), [4, 2, 0, 0, 0, 0, 0, 0, 0, 0]);
         assert_eq!(list(&bev, 3, 2), [2, 5, 0, 0, 0, 0, 0, 0, 0, 0]);
         assert_eq!(bev.iter().chain(&camera).filter(|entry| **entry == 9).count(), 0);
-        let mut lists = Correspondences::new(Intrinsics::PUBLISHED, &mut bev, &mut camera).unwrap();
-        lists.push(place(2.0, 10.0));
-        lists.clear();
+        let mut lists = Correspondences::new(Intrinsics::PUBLISHED);
+        lists.start(&mut bev, &mut camera).unwrap();
+        lists.push(place(2.0, 10.0), &mut bev, &mut camera);
+        lists.start(&mut bev, &mut camera).unwrap();
         assert_eq!(lists.finish(), Statistics::default());
         assert_eq!((bev, camera), ([0; ELEMENTS], [0; ELEMENTS]));
     }
@@ -297,8 +289,8 @@ mod tests {
         for length in [0, 639, 641] {
             let mut bad = std::vec![0; length];
             let error = InputSize { found: length as u32, expected: 640 };
-            assert_eq!(Correspondences::new(Intrinsics::PUBLISHED, &mut bad, &mut good).unwrap_err(), error);
-            assert_eq!(Correspondences::new(Intrinsics::PUBLISHED, &mut good, &mut bad).unwrap_err(), error);
+            assert_eq!(Correspondences::new(Intrinsics::PUBLISHED).start(&mut bad, &mut good).unwrap_err(), error);
+            assert_eq!(Correspondences::new(Intrinsics::PUBLISHED).start(&mut good, &mut bad).unwrap_err(), error);
         }
     }
 

@@ -2,6 +2,7 @@
 
 use super::{NotFinite, float::odd_q16};
 use fixed::types::I16F16;
+use serde::{Deserialize, Serialize};
 
 mod histogram;
 mod motion;
@@ -25,7 +26,7 @@ pub struct Point {
 }
 
 /// How the raw coordinates of a sensor lie.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum Axes {
     /// x left, y forward, z up (the simulator's sensor, turned by −90°).

@@ -1,8 +1,10 @@
 //! The order of several cameras.
 
+use serde::{Deserialize, Serialize};
+
 /// A camera by where it looks, in the order in which networks read them. TransFuser and AIM read the first view or
 /// all; LBC reads the first three, interleaved into one map.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 #[repr(u8)]
 pub enum View {

@@ -13,6 +13,7 @@ Examples:
   host-sim attention transfuser.img --model transfuser.pth --frames drive/
   host-sim drive transfuser.img --log drive/
   host-sim score route-1.json route-2.json
+  host-sim footprint firmware.elf
   host-sim completions bash";
 
 pub const RUN: &str = "Examples:
@@ -62,6 +63,11 @@ pub const BENCH: &str = "Examples:
   host-sim bench transfuser.img --backend portable --backend avx2 --rounds 50
   host-sim bench transfuser.img --all
   host-sim bench transfuser.img --json";
+
+pub const FOOTPRINT: &str = "Examples:
+  host-sim footprint target/mcu/thumbv7em-none-eabihf/release/an386-drive
+  host-sim footprint an386-check --stack measure::step --stack measure::parse
+  host-sim footprint an386-drive an547-drive virt-drive --json";
 
 pub const COMPLETIONS: &str = "In bash: `source <(host-sim completions bash)`, now or in ~/.bashrc.
 

@@ -98,8 +98,9 @@ impl<'a> Rig<'a> {
     fn sweep(&self, frame: &LoggedFrame, points: &[[u32; 3]], counts: &mut [i8]) -> Result<Reading<()>> {
         let Some(histogram) = self.histogram else { return Ok(Reading::Missing) };
         let refuse = |e| Error::new(ErrorCode::Unsupported, "input `bev`", format!("{e}"));
-        let mut sweep = Sweep::new(histogram, counts).map_err(refuse)?;
-        points.iter().for_each(|&point| sweep.push(frame.mounting.place(point)));
+        let mut sweep = Sweep::new(histogram);
+        sweep.start(counts).map_err(refuse)?;
+        points.iter().for_each(|&point| sweep.push(frame.mounting.place(point), counts));
         Ok(sweep.finish().into())
     }
 }
@@ -165,9 +166,10 @@ fn capture(path: &Path, map: Shape, view: View, codes: &mut [i8]) -> Result<Read
 /// Cells of Geometric Fusion: of the histogram, of the camera.
 fn cells(shape: Shape, frame: &LoggedFrame, points: &[[u32; 3]]) -> Result<[Vec<i8>; 2]> {
     let [mut bev, mut camera] = [(); 2].map(|()| vec![0; shape.elements() as usize]);
-    let lists = Correspondences::new(Intrinsics::PUBLISHED, &mut bev, &mut camera);
-    let mut lists = lists.map_err(|e| Error::new(ErrorCode::Unsupported, "input `bev_points`", e.to_string()))?;
-    points.iter().for_each(|&point| lists.push(frame.mounting.place(point)));
+    let mut lists = Correspondences::new(Intrinsics::PUBLISHED);
+    let refuse = |e| Error::new(ErrorCode::Unsupported, "input `bev_points`", format!("{e}"));
+    lists.start(&mut bev, &mut camera).map_err(refuse)?;
+    points.iter().for_each(|&point| lists.push(frame.mounting.place(point), &mut bev, &mut camera));
     lists.finish();
     Ok([bev, camera])
 }

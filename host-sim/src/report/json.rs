@@ -6,6 +6,7 @@ use crate::attention::AttentionReport;
 use crate::bench::figures::BenchReport;
 use crate::diff::Diff;
 use crate::drive::DriveReport;
+use crate::footprint::FootprintReport;
 use crate::gates::GateOutcome;
 use crate::metrics::{RouteLog, Score};
 use crate::run::RunReport;
@@ -53,6 +54,8 @@ pub enum Document {
     Score,
     /// Of a replayed log.
     Drive,
+    /// Of footprints.
+    Footprint,
     /// The log of a drive, which is read.
     RouteLog,
 }
@@ -66,6 +69,7 @@ pub fn schema(document: Document) -> Value {
         Document::Attention => written().into_root_schema_for::<AttentionReport>(),
         Document::Score => written().into_root_schema_for::<Score>(),
         Document::Drive => written().into_root_schema_for::<DriveReport>(),
+        Document::Footprint => written().into_root_schema_for::<FootprintReport>(),
         Document::RouteLog => SchemaSettings::default().into_generator().into_root_schema_for::<RouteLog>(),
     };
     schema.to_value()
@@ -126,6 +130,11 @@ pub fn score(score: &Score) -> Value {
 
 /// Document of a replayed log.
 pub fn drive(report: &DriveReport) -> Value {
+    to_value(report)
+}
+
+/// Document of footprints.
+pub fn footprint(report: &FootprintReport) -> Value {
     to_value(report)
 }
 

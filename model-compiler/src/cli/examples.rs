@@ -18,7 +18,9 @@ pub const COMPILE: &str = "Examples:
   model-compiler compile transfuser.pth --calib frames/ --target cortex-m7 -o transfuser.img
   model-compiler compile resnet20.onnx --calib images/ -o resnet20.img
   model-compiler compile transfuser.qmodel --ram 1536K --flash 128M -o transfuser.img
+  model-compiler compile transfuser.qmodel --region fast=64K --region main=1536K -o transfuser.img
   model-compiler compile transfuser.qmodel --target board.toml -o transfuser.img
+  model-compiler compile transfuser.qmodel --target cortex-m7 --revision 2 -o transfuser.img
   model-compiler compile transfuser.qmodel --format elf --address 0x08100000 --linker model.x -o model.o";
 
 pub const CONVERT: &str = "Examples:

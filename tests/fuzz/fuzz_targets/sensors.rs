@@ -76,7 +76,8 @@ fn lidar(data: &mut Unstructured<'_>) -> Result<()> {
     let shape = Shape::map(1 << data.int_in_range(0..=7)?, 1 << data.int_in_range(0..=7)?, 2);
     let histogram = Histogram::new(shape, fixed(data)?).expect("powers of two");
     let mut counts = vec![99; shape.elements() as usize];
-    let mut sweep = Sweep::new(histogram, &mut counts).expect("its own size");
+    let mut sweep = Sweep::new(histogram);
+    sweep.start(&mut counts).expect("its own size");
     let intrinsics = Intrinsics {
         focal_x: fixed(data)?,
         focal_y: fixed(data)?,
@@ -85,12 +86,13 @@ fn lidar(data: &mut Unstructured<'_>) -> Result<()> {
         height: fixed(data)?,
     };
     let (mut bev, mut cam) = ([99; ELEMENTS], [99; ELEMENTS]);
-    let mut lists = Correspondences::new(intrinsics, &mut bev, &mut cam).expect("their own sizes");
+    let mut lists = Correspondences::new(intrinsics);
+    lists.start(&mut bev, &mut cam).expect("their own sizes");
     let mut map = vec![0; heatmap::MAP.elements() as usize];
     while let Ok(bits) = <[u32; 3]>::arbitrary(data) {
         let point = mounting.place(bits).map(|point| motion.apply(point));
-        sweep.push(point);
-        lists.push(point);
+        sweep.push(point, &mut counts);
+        lists.push(point, &mut bev, &mut cam);
         let [right, y, speed] = bits;
         let _ = inputs::velocity(speed);
         if let Ok(goal) = inputs::goal([right, y]) {

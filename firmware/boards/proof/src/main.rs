@@ -1,56 +1,34 @@
-//! Links only if no panic is reachable: the panic handler calls a symbol that nothing defines, so that one reachable
-//! panic is a link error. What is linked is what drives: parse, check, inference, self-test, waypoints, every sensor
-//! and the driver of all systems.
+//! Links only if no panic is reachable in what drives: parse, check, inference, self-test, waypoints, every sensor, the
+//! driver of all systems, the computer that decodes what comes over a line, and the update of the image.
 //!
 //! The program is not meant to run. Each `twin-*` feature adds one panic of a usual kind at the end of a chain and must
 //! not link: so it shows, too, that the optimizer did not see the end of the chain as unreachable.
 #![no_std]
 #![no_main]
 
+mod computer;
+mod update;
+
 use core::hint::black_box;
-use core::panic::PanicInfo;
 use firmware::drive::{Driver, GpsPlane, Measurements, NetworkOutput, Output, Real, RouteNode, Status, Step, System};
-use firmware::engine::{Engine, Progress};
-use firmware::image::Image;
-use firmware::kernels::Portable;
 use firmware::sensors::camera::{Camera, CameraLayout};
 use firmware::sensors::correspondences::{Correspondences, Intrinsics};
 use firmware::sensors::lidar::{Heading, Histogram, Motion, Mounting, Pose, Sweep};
 use firmware::sensors::{heatmap, inputs};
 use firmware::waypoint::Waypoint;
 use fixed::types::I16F16;
-
-unsafe extern "C" {
-    safe fn a_panic_is_reachable() -> !;
-}
-
-#[panic_handler]
-fn panic(_: &PanicInfo<'_>) -> ! {
-    a_panic_is_reachable()
-}
+use proof::infer;
+use update::Flash;
 
 /// What a boot loader would call. Nothing is known of the image, the arena and the inputs.
 #[unsafe(no_mangle)]
 pub extern "C" fn start() -> bool {
-    let mut arena = [0; 64];
-    infer(black_box(&[]), black_box(&mut arena), black_box(&[])).is_some()
+    let [mut fast, mut main] = [[0; 64]; 2];
+    infer(black_box(&[]), [black_box(&mut fast), black_box(&mut main)], black_box(&[])).is_some()
         & sense(black_box(&Raw::default())).is_some()
         & drive(black_box(&Trip::default()))
-}
-
-fn infer(image: &[u8], arena: &mut [u8], inputs: &[&[u8]]) -> Option<()> {
-    let image = Image::parse(image).ok()?;
-    image.check().ok()?;
-    let mut engine = Engine::new(image, Portable, arena).ok()?;
-    engine.self_test().ok()?;
-    engine.start(inputs).ok()?;
-    while engine.step().ok()? != Progress::Done {}
-    black_box(engine.waypoints(0).ok()?);
-    let output = black_box(engine.output(0).ok()?);
-    if cfg!(feature = "twin-index") {
-        black_box(output[output.len() / 2]);
-    }
-    Some(())
+        & computer::compute(black_box(&[]), [black_box(&mut fast), black_box(&mut main)])
+        & update::receive(black_box(Flash::default()), black_box(&[])).is_some()
 }
 
 /// What sensors send, none of it trusted.
@@ -83,14 +61,14 @@ fn sense(raw: &Raw<'_>) -> Option<()> {
     let points = || raw.points.iter().map(|&bits| mounting.place(bits).map(|point| motion.apply(point)));
     let histogram = Histogram::new(raw.layout?.map, raw.split).ok()?;
     for histogram in [Histogram::TRANSFUSER, Histogram::BASELINES, histogram] {
-        let mut sweep = Sweep::new(histogram, black_box(&mut map)).ok()?;
-        black_box(&mut sweep).clear();
-        points().for_each(|point| sweep.push(point));
+        let mut sweep = Sweep::new(histogram);
+        black_box(&mut sweep).start(black_box(&mut map)).ok()?;
+        points().for_each(|point| sweep.push(point, black_box(&mut map)));
         black_box(sweep.finish());
     }
-    let mut cells = Correspondences::new(raw.intrinsics?, black_box(&mut map), black_box(&mut other)).ok()?;
-    black_box(&mut cells).clear();
-    points().for_each(|point| cells.push(point));
+    let mut cells = Correspondences::new(raw.intrinsics?);
+    black_box(&mut cells).start(black_box(&mut map), black_box(&mut other)).ok()?;
+    points().for_each(|point| cells.push(point, black_box(&mut map), black_box(&mut other)));
     black_box(cells.finish());
 
     let [a, b, c] = raw.numbers;

@@ -1,10 +1,12 @@
 //! Pixel formats: bytes of a row to color components, components to RGB.
 
+use serde::{Deserialize, Serialize};
+
 /// How the pixels of a camera lie in memory.
 ///
 /// Chroma samples belong to the pixels whose bytes they lie among: to two neighbors in YUYV (4:2:2), to two by two in
 /// NV12 (4:2:0). They are repeated, not interpolated, wherever the camera sited them.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum PixelFormat {
     /// Red, green, blue.
@@ -24,7 +26,7 @@ pub enum PixelFormat {
 }
 
 /// Codes of black and white in Y, and how far U and V reach around 128.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum YuvRange {
     /// Y 0..=255, U and V 128 ± 127.5 (JFIF).

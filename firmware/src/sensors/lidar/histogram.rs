@@ -121,39 +121,39 @@ impl From<Statistics> for Reading<()> {
 
 /// A histogram that grows point by point in the network's input. A frame that ends before [`Self::finish`] leaves
 /// counts of the points so far.
-#[derive(Debug)]
-pub struct Sweep<'a> {
+#[derive(Clone, Copy, Debug)]
+pub struct Sweep {
     histogram: Histogram,
-    counts: &'a mut [i8],
     statistics: Statistics,
 }
 
-impl<'a> Sweep<'a> {
-    /// Begins with all counts 0.
+impl Sweep {
+    /// A sweep before its first point; [`Self::start`] comes first.
+    pub const fn new(histogram: Histogram) -> Self {
+        let statistics = Statistics { points: 0, not_finite: 0, out_of_range: 0, saturated: 0 };
+        Self { histogram, statistics }
+    }
+
+    /// Begins anew, with all counts 0.
     ///
     /// # Errors
     /// The input does not have the histogram's size.
-    pub fn new(histogram: Histogram, counts: &'a mut [i8]) -> Result<Self, InputSize> {
-        InputSize::check(counts.len(), histogram.shape.elements())?;
+    pub fn start(&mut self, counts: &mut [i8]) -> Result<(), InputSize> {
+        InputSize::check(counts.len(), self.histogram.shape.elements())?;
         counts.fill(0);
-        Ok(Self { histogram, counts, statistics: Statistics::default() })
-    }
-
-    /// Begins anew.
-    pub fn clear(&mut self) {
-        self.counts.fill(0);
         self.statistics = Statistics::default();
+        Ok(())
     }
 
-    /// Counts a point, or that it is none.
-    pub fn push(&mut self, point: Result<Point, NotFinite>) {
+    /// Counts a point, or that it is none, in the input that was given to [`Self::start`].
+    pub fn push(&mut self, point: Result<Point, NotFinite>, counts: &mut [i8]) {
         let Statistics { points, not_finite, out_of_range, saturated } = &mut self.statistics;
         *points = points.saturating_add(1);
         let Ok(point) = point else {
             *not_finite = not_finite.saturating_add(1);
             return;
         };
-        let count = self.histogram.element(point).and_then(|element| self.counts.get_mut(index(element)));
+        let count = self.histogram.element(point).and_then(|element| counts.get_mut(index(element)));
         match count {
             None => *out_of_range = out_of_range.saturating_add(1),
             Some(count) if *count >= MAX_COUNT => *saturated = saturated.saturating_add(1),
@@ -162,8 +162,8 @@ impl<'a> Sweep<'a> {
     }
 
     /// Ends the sweep.
-    pub fn finish(self) -> Statistics {
-        self.statistics
+    pub fn finish(&mut self) -> Statistics {
+        core::mem::take(&mut self.statistics)
     }
 }
 
@@ -185,8 +185,9 @@ mod tests {
     fn a_sweep_without_points_is_a_missing_sensor() {
         let mut counts = vec![0; Histogram::TRANSFUSER.shape().elements() as usize];
         let mut reading = |points: &[Result<Point, NotFinite>]| {
-            let mut sweep = Sweep::new(Histogram::TRANSFUSER, &mut counts).unwrap();
-            points.iter().for_each(|&point| sweep.push(point));
+            let mut sweep = Sweep::new(Histogram::TRANSFUSER);
+            sweep.start(&mut counts).unwrap();
+            points.iter().for_each(|&point| sweep.push(point, &mut counts));
             Reading::from(sweep.finish())
         };
         let far = Mounting::TRAINED.place([1e4_f32.to_bits(); 3]);
@@ -248,18 +249,20 @@ mod tests {
     #[test]
     fn counts_saturate_and_every_point_is_accounted_for() {
         let mut input = vec![77_i8; 256 * 256 * 2];
-        let mut sweep = Sweep::new(Histogram::TRANSFUSER, &mut input).unwrap();
+        let mut sweep = Sweep::new(Histogram::TRANSFUSER);
+        sweep.start(&mut input).unwrap();
         let place = |point: [f32; 3]| Mounting::TRAINED.place(point.map(f32::to_bits));
         for point in [[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [f32::NAN, 1.0, 0.0], [0.0, f32::INFINITY, 0.0]] {
-            (0..7).for_each(|_| sweep.push(place(point)));
+            (0..7).for_each(|_| sweep.push(place(point), &mut input));
         }
         let statistics = sweep.finish();
         assert_eq!(statistics, Statistics { points: 28, not_finite: 14, out_of_range: 7, saturated: 2 });
         let counted: Vec<_> = input.iter().enumerate().filter(|(_, count)| **count != 0).collect();
         assert_eq!(counted, [((126 * 256 + 248) * 2 + 1, &MAX_COUNT)]);
-        let mut sweep = Sweep::new(Histogram::TRANSFUSER, &mut input).unwrap();
-        sweep.push(place([0.0, 2.0, 0.0]));
-        sweep.clear();
+        let mut sweep = Sweep::new(Histogram::TRANSFUSER);
+        sweep.start(&mut input).unwrap();
+        sweep.push(place([0.0, 2.0, 0.0]), &mut input);
+        sweep.start(&mut input).unwrap();
         assert_eq!(sweep.finish(), Statistics::default());
         assert!(input.iter().all(|count| *count == 0));
     }
@@ -270,7 +273,7 @@ mod tests {
             let found = Shape::map(height, width, channels);
             assert_eq!(Histogram::new(found, I16F16::ZERO), Err(HistogramError { found }));
         }
-        let error = Sweep::new(Histogram::TRANSFUSER, &mut [0; 100]).unwrap_err();
+        let error = Sweep::new(Histogram::TRANSFUSER).start(&mut [0; 100]).unwrap_err();
         assert_eq!(error, InputSize { found: 100, expected: 131_072 });
     }
 }

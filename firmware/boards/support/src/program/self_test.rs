@@ -3,8 +3,10 @@
 //! Prints a line per step (position, operator, instructions) and answers whether all bytes were right. The known answer
 //! is the f64 model's, so this shows that the board computes what the host's independent model computes.
 
+use crate::board::Bench;
 use crate::counter::Counter;
-use crate::machine::Machine;
+use crate::machine::say;
+use crate::stack;
 use crate::uart::Uart;
 use core::fmt::{self, Write};
 use firmware::engine::{Engine, Progress};
@@ -12,27 +14,17 @@ use firmware::image::Image;
 use firmware::kernels::Kernels;
 
 /// Runs the self-test and answers the exit status: 0 all bytes right, 1 not.
-pub fn run<U: Uart, C: Counter>(
-    machine: &mut Machine<U, C>,
-    image: &[u8],
-    kernels: impl Kernels,
-    arena: &mut [u8],
-) -> u8 {
-    let outcome = test(machine, image, kernels, arena);
+pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> u8 {
+    let outcome = test(bench);
+    let verdict = if outcome.is_ok() { "passed" } else { "failed" };
+    let (peak, capacity) = (stack::peak_bytes(), stack::capacity_bytes());
     // A UART takes whatever it is given.
-    let _ = match outcome {
-        Ok(()) => writeln!(machine, "self-test passed"),
-        Err(_) => writeln!(machine, "self-test failed"),
-    };
+    let _ = writeln!(bench.machine, "stack: {peak} of {capacity} bytes\nself-test {verdict}");
     u8::from(outcome.is_err())
 }
 
-fn test<U: Uart, C: Counter>(
-    machine: &mut Machine<U, C>,
-    bytes: &[u8],
-    kernels: impl Kernels,
-    arena: &mut [u8],
-) -> fmt::Result {
+fn test<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> fmt::Result {
+    let Bench { machine, image: bytes, kernels, arena, .. } = bench;
     let board = machine.name;
     let image = say(machine, Image::parse(bytes))?;
     writeln!(
@@ -44,7 +36,7 @@ fn test<U: Uart, C: Counter>(
         arena.len()
     )?;
     say(machine, image.check())?;
-    let mut engine = say(machine, Engine::new(image, kernels, arena))?;
+    let mut engine = say(machine, Engine::new(image, *kernels, arena))?;
     say(machine, engine.start_self_test())?;
     let mut total = 0;
     for position in 0.. {
@@ -61,16 +53,4 @@ fn test<U: Uart, C: Counter>(
         }
     }
     writeln!(machine, "     {:<18} {total:>12} instructions, the CRC of every output included", "total")
-}
-
-/// Prints an error.
-fn say<U: Uart, C: Counter, T, E: fmt::Display>(
-    machine: &mut Machine<U, C>,
-    result: Result<T, E>,
-) -> Result<T, fmt::Error> {
-    result.map_err(|error| {
-        let board = machine.name;
-        let _ = writeln!(machine, "{board}: {error}");
-        fmt::Error
-    })
 }

@@ -1,23 +1,22 @@
 //! 64-bit Arm on QEMU's `virt` board: one core, no operating system, memory management unit off. Model image and arena
 //! lie in the RAM.
 #![no_std]
-#![no_main]
 
 use board_support::counter::Counter;
-use board_support::image_memory;
+use board_support::image_memory::ImageMemory;
 use board_support::uart::Pl011;
-use board_support::{Machine, program, semihosting};
+use board_support::{Board, Machine};
 use core::arch::{asm, global_asm};
 use core::slice;
 use firmware::kernels::Portable;
 
 const UART: usize = 0x0900_0000;
 const IMAGE: usize = 0x5000_0000;
-const IMAGE_BYTES: usize = 192 << 20;
+const IMAGE_BYTES: u32 = 192 << 20;
 const ARENA: usize = 0x4800_0000;
 const ARENA_BYTES: usize = 64 << 20;
 
-// Vector registers on, stack, zeroed statics; then Rust.
+// Vector registers on, stack, zeroed statics, stack painted (see `board_support::stack`); then the program.
 global_asm!(
     ".section .start, \"ax\"",
     ".global start",
@@ -25,7 +24,7 @@ global_asm!(
     "mov x0, #(3 << 20)",
     "msr cpacr_el1, x0",
     "isb",
-    "ldr x0, =stack_top",
+    "ldr x0, =_stack_start",
     "mov sp, x0",
     "ldr x0, =bss_start",
     "ldr x1, =bss_end",
@@ -33,13 +32,19 @@ global_asm!(
     "b.hs 2f",
     "stp xzr, xzr, [x0], #16",
     "b 1b",
-    "2: bl {main}",
-    main = sym main,
+    "2: ldr x0, =_stack_end",
+    "ldr x1, =_stack_start",
+    "ldr w2, =0xcccccccc",
+    "3: cmp x0, x1",
+    "b.hs 4f",
+    "str w2, [x0], #4",
+    "b 3b",
+    "4: bl main",
 );
 
 /// The generic timer.
 #[derive(Debug)]
-struct GenericTimer;
+pub struct GenericTimer;
 
 impl Counter for GenericTimer {
     fn ticks(&mut self) -> u64 {
@@ -57,13 +62,22 @@ impl Counter for GenericTimer {
     }
 }
 
-extern "C" fn main() -> ! {
+/// The board.
+///
+/// # Safety
+/// The program runs on this board, and calls this once.
+pub unsafe fn board() -> Board<Pl011, GenericTimer, Portable> {
     // SAFETY: the board's UART, made once.
     let uart = unsafe { Pl011::new(UART) };
-    let mut machine = Machine { name: "virt", uart, counter: GenericTimer };
     // SAFETY: both ranges are RAM of the board, apart from each other and from what the linker uses; any bytes are
-    // valid, no other reference to them exists, and nothing writes the image's.
-    let (image, arena) =
-        unsafe { (image_memory::stored(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
-    semihosting::exit(program::self_test::run(&mut machine, image, Portable, arena))
+    // valid, and no other reference to them exists.
+    let (images, arena) =
+        unsafe { (ImageMemory::new(IMAGE, IMAGE_BYTES), slice::from_raw_parts_mut(ARENA as *mut u8, ARENA_BYTES)) };
+    Board {
+        machine: Machine { name: "virt", uart, counter: GenericTimer },
+        images,
+        target: "cortex-a",
+        kernels: Portable,
+        arena,
+    }
 }

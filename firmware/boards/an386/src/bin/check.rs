@@ -1,0 +1,14 @@
+//! Checks on the Cortex-M4F, for the bench and for tests: see [`board_support::program::check`].
+#![no_std]
+#![no_main]
+
+use board_support::program::check;
+use board_support::semihosting;
+use cortex_m_rt::entry;
+
+#[entry]
+fn main() -> ! {
+    // SAFETY: this is the board, and nothing else takes it.
+    let mut bench = unsafe { an386::board() }.bench();
+    semihosting::exit(check::run(&mut bench))
+}
