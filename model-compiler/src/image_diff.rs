@@ -7,7 +7,7 @@
 
 use crate::artifact::{hex, sha256};
 use crate::error::{Error, ErrorCode, Result};
-use firmware::image::{Image, Port, SectionKind, TensorRecord};
+use firmware::image::{Image, Port, Region, SectionKind, TensorRecord};
 use firmware::program::{ConstRange, Step};
 use firmware::tensor::{ElementType, TensorId};
 use serde::Serialize;
@@ -120,14 +120,18 @@ fn header(image: &Image<'_>) -> Facts {
         ("qmodel", hex(&image.qmodel_digest())),
         ("build", hex(&image.build_digest())),
         ("features", format!("{:#x}", image.features())),
-        ("arena bytes", image.arena_bytes().to_string()),
-        ("arena alignment", image.arena_alignment().to_string()),
+        ("target", image.target().to_owned()),
+        ("revision", image.revision().to_string()),
         ("steps", image.step_count().to_string()),
         ("tensors", image.tensor_count().to_string()),
         ("work", image.work().to_string()),
         ("known answer's seed", image.known_answer().map_or("none".into(), |answer| answer.seed().to_string())),
     ];
-    facts.map(|(name, value)| (name.to_owned(), value)).into()
+    let facts = facts.map(|(name, value)| (name.to_owned(), value));
+    let regions = image.regions().map(|Region { name, bytes, alignment }| {
+        (format!("arena {}", name.as_str()), format!("{bytes} B, aligned to {alignment}"))
+    });
+    facts.into_iter().chain(regions).collect()
 }
 
 fn ports(image: &Image<'_>) -> Result<Facts> {
@@ -233,7 +237,9 @@ fn changed_step(before: &Placed<'_>, after: &Placed<'_>) -> Result<Option<StepCh
         let operand =
             |(name, id): &(String, TensorId)| Ok((name.clone(), shape(&placed.image.tensor(*id).ok_or_else(changed)?)));
         let operands = fields.tensors.iter().map(operand).collect::<Result<Facts>>()?;
-        let offset = ("arena offset".to_owned(), placed.output.offset.to_string());
+        let TensorRecord { region, offset, .. } = placed.output;
+        let name = placed.image.region(region).ok_or_else(changed)?.name;
+        let offset = ("arena offset".to_owned(), format!("{} {offset}", name.as_str()));
         Ok([operands, fields.numbers.clone(), vec![offset]].concat())
     };
     let change = StepChange {
