@@ -164,7 +164,7 @@ fn converse(
     let mut run = Run::new(options, image, model, &introduction);
     match course {
         Course::Frames { frames, folder, host } => {
-            run.frames(&frames, folder.as_deref(), host, &mut session, progress)?
+            run.frames(&frames, folder.as_deref(), *host, &mut session, progress)?
         }
         Course::Log { log, decisions } => run.log(&log, &decisions, &mut session, progress)?,
     }
@@ -177,7 +177,7 @@ fn converse(
 
 /// What is to be sent, and what it is compared with.
 enum Course<'a> {
-    Frames { frames: Vec<Frame>, folder: Option<PathBuf>, host: Host<'a> },
+    Frames { frames: Vec<Frame>, folder: Option<PathBuf>, host: Box<Host<'a>> },
     Log { log: Log, decisions: Vec<Decision> },
 }
 
@@ -192,7 +192,7 @@ impl<'a> Course<'a> {
                     // Sizes that no board's sensors fill are told before one is started.
                     Rig::new(&image, system::of_image(&image)?).map_err(|e| e.with_help(CROP_HELP))?;
                 }
-                Ok(Self::Frames { frames, folder, host: Host::new(image, options.backend)? })
+                Ok(Self::Frames { frames, folder, host: Box::new(Host::new(image, options.backend)?) })
             }
             Feed::Log(folder) => {
                 system::of_image(&image)?;

@@ -12,7 +12,7 @@ fn is_there(board: Board) -> bool {
     if !is_there {
         let _ = writeln!(
             std::io::stderr(),
-            "not run: hardware in the loop on {}; tests/run builds {} and installs {} (Debian's package qemu-system-arm)",
+            "not run: hil on {}; tests/run builds {} and installs {} (Debian's package qemu-system-arm)",
             board.name(),
             board.program().display(),
             board.emulator()

@@ -66,7 +66,8 @@ struct PlaceArgs {
 #[derive(Debug, Args)]
 struct FeedArgs {
     /// Frame directory, for driving networks as sensor data; for classifiers a folder of images.
-    #[arg(long, value_name = "DIR", required_unless_present_any = ["inputs", "log"], conflicts_with_all = ["inputs", "log"])]
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["inputs", "log"])]
+    #[arg(conflicts_with_all = ["inputs", "log"])]
     frames: Option<PathBuf>,
     /// Raw network inputs by name, first dimension = frames.
     #[arg(long, value_name = "FILE.safetensors", conflicts_with = "log")]
