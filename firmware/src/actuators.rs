@@ -103,6 +103,12 @@ fn duty(share: Real, max: u16) -> u16 {
 }
 
 #[cfg(test)]
+#[allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects,
+    reason = "what is missing fails the test"
+)]
 mod tests {
     use super::*;
     use crate::drive::{Controls, Fault};

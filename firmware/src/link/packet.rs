@@ -193,6 +193,12 @@ impl Receiver {
 }
 
 #[cfg(test)]
+#[allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::arithmetic_side_effects,
+    reason = "what is missing fails the test"
+)]
 mod tests {
     extern crate std;
     use super::*;
