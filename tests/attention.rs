@@ -39,7 +39,7 @@ fn rows_times_values_are_the_context_of_every_block() {
     let image = Image::parse(&bytes).unwrap();
     let inputs = inputs(&project);
     let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
-    let mut arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
+    let mut arena = GuardedArena::new(&image);
     let mut engine = Engine::new(image, Portable, arena.poisoned(0)).unwrap();
     let mut written: BTreeMap<TensorId, Vec<i32>> = BTreeMap::new();
     let mut blocks = 0;

@@ -2,7 +2,7 @@
 //! messages stand here as users read them.
 
 use firmware::engine::{Engine, EngineError};
-use firmware::image::{Image, layout};
+use firmware::image::{Image, RegionName, layout};
 use firmware::kernels::Portable;
 use model_compiler::artifact;
 use model_compiler::emit::{AlignedBytes, reseal};
@@ -137,11 +137,11 @@ fn arenas_that_do_not_fit() {
     let mut arena = AlignedBytes::zeroed(needed as usize + 16);
     let refusal = |arena: &mut [u8]| Engine::new(image, Portable, arena).map(|_| ()).unwrap_err();
     let error = refusal(&mut arena[..needed as usize - 1]);
-    assert_eq!(error, EngineError::ArenaTooSmall { found: needed - 1, needed });
-    assert_eq!(error.to_string(), format!("arena: {} bytes, the image needs {needed}", needed - 1));
+    assert_eq!(error, EngineError::ArenaTooSmall { region: RegionName::MAIN, found: needed - 1, needed });
+    assert_eq!(error.to_string(), format!("arena main: {} bytes, the image needs {needed}", needed - 1));
     let error = refusal(&mut arena[4..]);
-    assert_eq!(error, EngineError::ArenaMisaligned { remainder: 4, alignment: 16 });
-    assert_eq!(error.to_string(), "arena: starts 4 bytes behind a multiple of 16");
+    assert_eq!(error, EngineError::ArenaMisaligned { region: RegionName::MAIN, remainder: 4, alignment: 16 });
+    assert_eq!(error.to_string(), "arena main: starts 4 bytes behind a multiple of 16");
     // The image itself must be aligned, too.
     let mut shifted = AlignedBytes::zeroed(bytes.len() + 16);
     shifted[8..8 + bytes.len()].copy_from_slice(&bytes);

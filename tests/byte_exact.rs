@@ -38,7 +38,7 @@ fn assert_byte_exact(compiled: &Compiled, frames: &[Frame], backend: Backend) {
 fn assert_self_test_passes(compiled: &Compiled) {
     let bytes = AlignedBytes::from(compiled.image.as_slice());
     let image = Image::parse(&bytes).unwrap_or_else(|e| panic!("{e}"));
-    let mut arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
+    let mut arena = GuardedArena::new(&image);
     let mut engine = Engine::new(image, Portable, arena.poisoned(0)).unwrap_or_else(|e| panic!("{e}"));
     engine.self_test().unwrap_or_else(|e| panic!("{e}"));
 }

@@ -126,8 +126,8 @@ fn the_arena_fits_a_microcontroller() -> Result<()> {
         let target = Target::find(name)?.with_limits(Some(MAX_ARENA_BYTES), Some(2 << 20));
         let compiled = pipeline::compile(&model, &target, &PlanOptions::for_target(&target), &mut |_, _, _| {})?;
         let plan = &compiled.record.plan;
-        println!("{name}: arena {} B, {} MACs", plan.arena_bytes, graph.macs());
-        assert!(plan.arena_bytes <= MAX_ARENA_BYTES);
+        println!("{name}: arena {} B, {} MACs", plan.arena_bytes(), graph.macs());
+        assert!(plan.arena_bytes() <= MAX_ARENA_BYTES);
     }
     Ok(())
 }

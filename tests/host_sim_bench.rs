@@ -43,7 +43,7 @@ fn the_document_has_the_same_figures_for_every_step() {
     let digest = model_compiler::artifact::hex(&project.compiled.record.image_sha256);
     assert_eq!(report["model"]["sha256"], digest);
     assert_eq!(report["image_bytes"], project.compiled.image.len());
-    assert_eq!(report["arena_bytes"], project.compiled.record.plan.arena_bytes);
+    assert_eq!(report["arena_bytes"], project.compiled.record.plan.arena_bytes());
     let list = |value: &Value| value.as_array().expect("a list").clone();
     let names = |times: &Value| list(times).iter().map(|time| time["backend"].clone()).collect::<Vec<_>>();
     assert_eq!(names(&report["backends"]), of_this_machine());

@@ -309,12 +309,12 @@ fn checked_plan(title: &str, model: &QModel, options: &PlanOptions) -> MemoryPla
     }
     println!(
         "{title}: arena {} bytes ({:.3} MiB), bound {}, {:?}, peak at {} ({}), {} nodes",
-        plan.arena_bytes,
-        plan.arena_bytes as f64 / MIB as f64,
-        plan.bound_bytes,
-        plan.status,
-        plan.peak_step,
-        model.steps[plan.order[plan.peak_step as usize] as usize].name,
+        plan.arena_bytes(),
+        plan.arena_bytes() as f64 / MIB as f64,
+        plan.bound_bytes(),
+        plan.status(),
+        plan.regions[0].peak_step,
+        model.steps[plan.order[plan.regions[0].peak_step as usize] as usize].name,
         plan.nodes
     );
     plan
@@ -324,10 +324,10 @@ fn checked_plan(title: &str, model: &QModel, options: &PlanOptions) -> MemoryPla
 fn transfuser_fits_into_1_4_mib() {
     let model = transfuser(ElementType::I8);
     let plan = checked_plan("i8 maps", &model, &PlanOptions::default());
-    assert_eq!(plan.status, PlanStatus::Optimal);
+    assert_eq!(plan.status(), PlanStatus::Optimal);
     // The second stem's input and output beside the first branch's pooled map; the rest is scratch.
-    assert!(plan.arena_bytes > 128 * KIB + MIB + 256 * KIB);
-    assert!(5 * plan.arena_bytes <= 7 * MIB, "{}", plan.arena_bytes);
+    assert!(plan.arena_bytes() > 128 * KIB + MIB + 256 * KIB);
+    assert!(5 * plan.arena_bytes() <= 7 * MIB, "{}", plan.arena_bytes());
 }
 
 #[test]
@@ -335,21 +335,21 @@ fn transfuser_without_in_place_pooling_needs_one_and_a_half_mib() {
     let model = transfuser(ElementType::I8);
     let options = PlanOptions { in_place_pooling: false, ..PlanOptions::default() };
     let plan = checked_plan("i8 maps, pools apart", &model, &options);
-    assert_eq!(plan.status, PlanStatus::Optimal);
+    assert_eq!(plan.status(), PlanStatus::Optimal);
     // A stem, its pooled map, the other branch's pooled map; goal and velocity.
-    assert_eq!(plan.arena_bytes, MIB + 512 * KIB + 8 + 4);
+    assert_eq!(plan.arena_bytes(), MIB + 512 * KIB + 8 + 4);
 }
 
 #[test]
 fn transfuser_with_wide_skips_is_planned_to_the_bound() {
     let model = transfuser(ElementType::I16);
     let plan = checked_plan("i16 skips", &model, &PlanOptions::default());
-    assert_eq!(plan.status, PlanStatus::Optimal);
-    assert!(plan.arena_bytes <= 128 * KIB + 2 * MIB + 512 * KIB + 32 * KIB);
+    assert_eq!(plan.status(), PlanStatus::Optimal);
+    assert!(plan.arena_bytes() <= 128 * KIB + 2 * MIB + 512 * KIB + 32 * KIB);
     let apart = PlanOptions { in_place_pooling: false, ..PlanOptions::default() };
     let plan = checked_plan("i16 skips, pools apart", &model, &apart);
-    assert_eq!(plan.status, PlanStatus::Optimal);
-    assert_eq!(plan.arena_bytes, 3 * MIB + 8 + 4);
+    assert_eq!(plan.status(), PlanStatus::Optimal);
+    assert_eq!(plan.arena_bytes(), 3 * MIB + 8 + 4);
 }
 
 #[test]
@@ -357,7 +357,7 @@ fn every_alignment_is_planned_to_the_bound() {
     let model = transfuser(ElementType::I8);
     for alignment in [4, 16, 64] {
         let plan = checked_plan("aligned", &model, &PlanOptions { alignment, ..PlanOptions::default() });
-        assert_eq!(plan.status, PlanStatus::Optimal, "alignment {alignment}");
+        assert_eq!(plan.status(), PlanStatus::Optimal, "alignment {alignment}");
         assert!(plan.tensors.iter().all(|p| p.offset.is_multiple_of(u64::from(alignment))));
     }
     let odd = PlanOptions { alignment: 12, ..PlanOptions::default() };
@@ -370,11 +370,11 @@ fn order_and_pairs_pay() {
     let best = checked_plan("all", &model, &PlanOptions::default());
     let own = checked_plan("own order", &model, &PlanOptions { search_order: false, ..PlanOptions::default() });
     assert!(own.order.iter().copied().eq(0..model.steps.len() as u32));
-    assert!(best.arena_bytes + 512 * KIB < own.arena_bytes);
+    assert!(best.arena_bytes() + 512 * KIB < own.arena_bytes());
     let apart = checked_plan("no sums in place", &model, &PlanOptions { in_place: false, ..PlanOptions::default() });
     assert!(best.tensors.iter().filter(|p| p.in_place_of.is_some()).count() > 100);
     assert!(apart.tensors.iter().filter(|p| p.in_place_of.is_some()).count() <= 2);
-    assert!(best.arena_bytes <= apart.arena_bytes);
+    assert!(best.arena_bytes() <= apart.arena_bytes());
 }
 
 #[test]
@@ -396,7 +396,7 @@ fn checker_catches_sabotage() {
     let conv = good.scratch.iter().position(Option::is_some).unwrap();
     let cases: [(&str, Sabotage<'_>); 14] = [
         ("overlap", &|p| p.tensors[stem].offset = p.tensors[id("bev")].offset),
-        ("outside the arena", &|p| p.tensors[stem].offset = p.arena_bytes - 4),
+        ("outside the arena", &|p| p.tensors[stem].offset = p.regions[0].bytes - 4),
         ("is not a multiple", &|p| p.tensors[stem].offset += 2),
         ("bytes, expected", &|p| p.tensors[stem].bytes -= 1),
         ("live", &|p| p.tensors[stem].last_step -= 1),
@@ -404,11 +404,11 @@ fn checker_catches_sabotage() {
         ("may not take over", &|p| p.tensors[taker].in_place_of = Some(QTensorId(stem as u32))),
         ("not at the offset", &|p| p.tensors[taker].offset += 4),
         ("overlap", &|p| p.tensors[taker].in_place_of = None),
-        ("is written", &|p| p.order.swap(0, 1 + p.peak_step as usize)),
+        ("is written", &|p| p.order.swap(0, 1 + p.regions[0].peak_step as usize)),
         ("every step once", &|p| p.order[0] = p.order[1]),
-        ("expected", &|p| p.bound_bytes += 4),
+        ("expected", &|p| p.regions[0].bound_bytes += 4),
         ("missing", &|p| p.scratch[conv] = None),
-        ("Optimal", &|p| p.arena_bytes += 4),
+        ("Optimal", &|p| p.regions[0].bytes += 4),
     ];
     for (number, (reason, sabotage)) in cases.into_iter().enumerate() {
         let mut bad = good.clone();
@@ -448,11 +448,11 @@ fn an_operand_that_is_needed_later_is_not_overwritten() {
 fn too_big_says_by_how_much_and_why() {
     let model = transfuser(ElementType::I8);
     let plan = checked_plan("tight", &model, &PlanOptions::default());
-    let exact = portable().with_limits(Some(plan.arena_bytes), Some(5 * MIB));
+    let exact = portable().with_limits(Some(plan.arena_bytes()), Some(5 * MIB));
     exact.fits(&model, &plan, 5 * MIB).unwrap();
-    let error = exact.clone().with_limits(Some(plan.arena_bytes - 4), None).fits(&model, &plan, 0).unwrap_err();
+    let error = exact.clone().with_limits(Some(plan.arena_bytes() - 4), None).fits(&model, &plan, 0).unwrap_err();
     assert_eq!(error.code, ErrorCode::TooBig);
-    let peak = &model.steps[plan.order[plan.peak_step as usize] as usize].name;
+    let peak = &model.steps[plan.order[plan.regions[0].peak_step as usize] as usize].name;
     for part in ["4 too many", peak.as_str(), "1048576", "goal", "--ram"] {
         assert!(error.to_string().contains(part), "'{part}' not in:\n{error}");
     }

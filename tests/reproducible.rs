@@ -3,6 +3,7 @@
 use firmware::engine::Engine;
 use firmware::image::Image;
 use firmware::kernels::Portable;
+use host_sim::buffers::GuardedArena;
 use model_compiler::artifact;
 use model_compiler::emit::AlignedBytes;
 use model_compiler::frames::Frame;
@@ -39,10 +40,8 @@ fn outputs(compiled: &Compiled, frame: &Frame) -> Vec<Vec<u8>> {
     let inputs: Vec<&[u8]> = inputs.iter().map(Vec::as_slice).collect();
     let bytes = AlignedBytes::from(compiled.image.as_slice());
     let image = Image::parse(&bytes).unwrap_or_else(|e| panic!("{e}"));
-    let alignment = image.arena_alignment() as usize;
-    let mut memory = AlignedBytes::zeroed(image.arena_bytes() as usize + alignment);
-    let start = memory.as_ptr().addr().next_multiple_of(alignment) - memory.as_ptr().addr();
-    let mut engine = Engine::new(image, Portable, &mut memory[start..]).unwrap_or_else(|e| panic!("{e}"));
+    let mut arena = GuardedArena::new(&image);
+    let mut engine = Engine::new(image, Portable, arena.poisoned(0)).unwrap_or_else(|e| panic!("{e}"));
     engine.infer(&inputs).unwrap_or_else(|e| panic!("{e}"));
     (0..model.outputs.len()).map(|i| engine.output(i).unwrap().to_vec()).collect()
 }
@@ -133,15 +132,15 @@ fn the_published_network_keeps_its_sizes() {
         let compiled = compiled_for(&model, &target, &PlanOptions::for_target(&target));
         describe(&compiled);
         let plan = &compiled.record.plan;
-        assert_eq!(plan.status, PlanStatus::Optimal, "{name}");
-        assert!(plan.arena_bytes * 100 <= 140 * MIB, "{name}: {} B", plan.arena_bytes);
+        assert_eq!(plan.status(), PlanStatus::Optimal, "{name}");
+        assert!(plan.arena_bytes() * 100 <= 140 * MIB, "{name}: {} B", plan.arena_bytes());
         assert!(compiled.image.len() as u64 * 100 <= 104 * weights, "{name}: {} B of {weights}", compiled.image.len());
     }
     let target = Target::find("portable").unwrap();
     let apart = PlanOptions { in_place_pooling: false, ..PlanOptions::for_target(&target) };
     let compiled = compiled_for(&model, &target, &apart);
     describe(&compiled);
-    assert_eq!(compiled.record.plan.status, PlanStatus::Optimal);
+    assert_eq!(compiled.record.plan.status(), PlanStatus::Optimal);
     // A stem, its pooled map, the other branch's pooled map; goal and velocity.
-    assert_eq!(compiled.record.plan.arena_bytes, MIB + 512 * KIB + 12);
+    assert_eq!(compiled.record.plan.arena_bytes(), MIB + 512 * KIB + 12);
 }

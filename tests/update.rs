@@ -85,6 +85,7 @@ fn work_per_call_is_bounded() {
     // The first call parses, the next ones read 64 bytes each: more than the file has, as sections are padded.
     let calls = (0..).take_while(|_| updater.finish(64).unwrap() != CheckProgress::Done).count();
     assert!(calls >= (new.len() - header::BYTES) / 64, "{calls}");
+    assert!(size_of_val(&updater) <= 512, "{} bytes", size_of_val(&updater));
     let flash = updater.into_flash();
     // A claim (erase and write), 256 bytes per write, 512 per sector, the record.
     assert_eq!(flash.operations().len(), 2 + new.len().div_ceil(256) + new.len().div_ceil(512) + 1);
@@ -133,7 +134,7 @@ fn a_foreign_image_is_refused_before_a_sector_is_erased() {
     let cases = [
         (changed(|p| p.target = "cortex-m7".into()), "compiled for target cortex-m7, this is cortex-m4"),
         (changed(|p| p.target.clear()), "compiled for target unknown, this is cortex-m4"),
-        (changed(|p| p.arena_bytes = 80), "memory region 0: needs 80 bytes of arena, there are 64"),
+        (changed(|p| p.regions[0].bytes = 80), "memory region 0: needs 80 bytes of arena, there are 64"),
         (changed(|p| p.revision = 3), "revision 3 is older than the running 4"),
         (changed(|p| p.constants = vec![0; ROOM]), "the slot has room for 4096"),
     ];

@@ -146,49 +146,43 @@ fn old_or_new_starts_after_a_cut_anywhere_page_by_page() {
     assert!(sweep::<256, 4096>() > 1000);
 }
 
-/// A wrong updater, as what it would have the flash do.
+/// A wrong updater, as what it makes of the operations of the right one.
 type Mutant = fn(Vec<Operation>, &Device<4, 256>) -> Vec<Operation>;
 
-/// Position of the write of the record's body, and those of the image's operations.
-fn parts(operations: &[Operation], device: &Device<4, 256>) -> (usize, Vec<usize>) {
-    let record =
-        (device.slots.image_offset(Slot::B) + device.slots.image_capacity()) % device.flash.bytes().len() as u32;
-    let is_record =
-        |at: u32| [record, device.slots.image_capacity()].iter().any(|start| (*start..*start + 256).contains(&at));
-    let start = |operation: &Operation| match operation {
-        Operation::Erase(range) => range.start,
-        Operation::Write(at, _) => *at,
+/// The operations on the image: those between the claim and the body of the record.
+fn image_operations(operations: &[Operation]) -> Range<usize> {
+    let position = |is_it: fn(&[u8]) -> bool| {
+        let of_it = |operation: &Operation| matches!(operation, Operation::Write(_, bytes) if is_it(bytes));
+        operations.iter().position(of_it).expect("the record is written")
     };
-    let is_body = |operation: &Operation| matches!(operation, Operation::Write(_, bytes) if bytes.len() == 16 && crc32(&bytes[..12]).to_le_bytes() == bytes[12..]);
-    let body = operations.iter().position(is_body).expect("the record is written");
-    let image = (0..operations.len()).filter(|n| !is_record(start(&operations[*n]))).collect();
-    (body, image)
+    let claim = position(|bytes| bytes == CLAIM);
+    let body = position(|bytes| bytes.len() == 16 && crc32(&bytes[..12]).to_le_bytes() == bytes[12..]);
+    claim + 1..body
 }
 
-fn record_first(mut operations: Vec<Operation>, device: &Device<4, 256>) -> Vec<Operation> {
-    let (body, image) = parts(&operations, device);
-    let body = operations.remove(body);
-    operations.insert(image[0], body);
+fn record_first(mut operations: Vec<Operation>, _: &Device<4, 256>) -> Vec<Operation> {
+    let image = image_operations(&operations);
+    operations[image.start..=image.end].rotate_right(1);
     operations
 }
 
-fn old_record_kept_until_the_end(mut operations: Vec<Operation>, device: &Device<4, 256>) -> Vec<Operation> {
-    let (_, image) = parts(&operations, device);
-    // Erase and claim are the two operations before the image.
-    operations[image[0] - 2..=image[image.len() - 1]].rotate_left(2);
+fn old_record_kept_until_the_end(mut operations: Vec<Operation>, _: &Device<4, 256>) -> Vec<Operation> {
+    let image = image_operations(&operations);
+    // Before the image, the record is erased and the slot claimed.
+    operations[image.start - 2..image.end].rotate_left(2);
     operations
 }
 
-fn no_claim(operations: Vec<Operation>, _: &Device<4, 256>) -> Vec<Operation> {
-    let is_claim = |operation: &Operation| matches!(operation, Operation::Write(_, bytes) if *bytes == CLAIM);
-    operations.into_iter().filter(|operation| !is_claim(operation)).collect()
+fn no_claim(mut operations: Vec<Operation>, _: &Device<4, 256>) -> Vec<Operation> {
+    let image = image_operations(&operations);
+    operations.remove(image.start - 1);
+    operations
 }
 
 fn into_the_running_slot(mut operations: Vec<Operation>, device: &Device<4, 256>) -> Vec<Operation> {
-    let (_, image) = parts(&operations, device);
     let [a, b] = [Slot::A, Slot::B].map(|slot| device.slots.image_offset(slot));
     let other = |at: u32| if at < b { at - a + b } else { at - b + a };
-    for n in image {
+    for n in image_operations(&operations) {
         operations[n] = match operations[n].clone() {
             Operation::Erase(range) => Operation::Erase(other(range.start)..other(range.end - 1) + 1),
             Operation::Write(at, bytes) => Operation::Write(other(at), bytes),
@@ -197,9 +191,10 @@ fn into_the_running_slot(mut operations: Vec<Operation>, device: &Device<4, 256>
     operations
 }
 
-fn without_an_erase(mut operations: Vec<Operation>, device: &Device<4, 256>) -> Vec<Operation> {
-    let (_, image) = parts(&operations, device);
-    operations.remove(image[0]);
+fn without_an_erase(mut operations: Vec<Operation>, _: &Device<4, 256>) -> Vec<Operation> {
+    let image = image_operations(&operations);
+    let second = image.clone().filter(|n| matches!(operations[*n], Operation::Erase(_))).nth(1);
+    operations.remove(second.expect("an image of several sectors"));
     operations
 }
 

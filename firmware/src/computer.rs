@@ -42,6 +42,7 @@ pub use rig::{CAMERA_WORDS, MAX_CAMERAS, Memory};
 pub use store::{ImageStore, NoStore};
 
 use crate::actuators::Actuate;
+use crate::arena::Regions;
 use crate::drive::{Controls, Fault, Output, Real, Status};
 use crate::engine::{Engine, EngineError};
 use crate::image::{CheckError, CheckProgress, Checker, Image, ParseError};
@@ -135,8 +136,8 @@ pub struct Computer<'a, B, A, K, S> {
     pub image: &'a [u8],
     /// Backend of the core.
     pub kernels: K,
-    /// Memory of the engine.
-    pub arena: &'a mut [u8],
+    /// Memory of the engine: one buffer per memory region of the image, in its order.
+    pub arena: Regions<'a>,
     /// Memory of the sensors.
     pub memory: &'a mut Memory,
     /// State of the line.
@@ -152,7 +153,7 @@ pub struct Computer<'a, B, A, K, S> {
 impl<B: Board, A: Actuate, K: Kernels + Copy, S: ImageStore> Computer<'_, B, A, K, S> {
     /// Runs until the feeder ends it. Begins in the safe state.
     pub fn run(self) -> Exit {
-        let Self { image, kernels, arena, memory, line, board, actuators, store } = self;
+        let Self { image, kernels, mut arena, memory, line, board, actuators, store } = self;
         stop(actuators);
         let (image, times) = match start(image, board) {
             Ok(started) => started,
@@ -162,7 +163,7 @@ impl<B: Board, A: Actuate, K: Kernels + Copy, S: ImageStore> Computer<'_, B, A, 
         let mut test = SelfTest::new(image);
         loop {
             let rig = Rig::new(&image, &configuration, memory).or_else(|_| Rig::without_sensors(&image));
-            let engine = Engine::new(image, kernels, arena).map_err(StartError::Engine);
+            let engine = Engine::new(image, kernels, arena.reborrow()).map_err(StartError::Engine);
             let (rig, engine) = match (rig, engine) {
                 (Ok(rig), Ok(engine)) => (rig, engine),
                 (Err(_), _) => return refuse_all(StartError::Sensors, line, board, store),

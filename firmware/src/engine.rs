@@ -1,4 +1,4 @@
-//! The engine: runs a parsed image in the caller's arena, one step at a time.
+//! The engine: runs a parsed image in the caller's memory, one step at a time.
 //!
 //! [`Engine::start`] copies the inputs into the arena, each [`Engine::step`] runs one operator to its end, and after
 //! [`Progress::Done`] the outputs can be read. Between two steps the caller may do anything else: feed a watchdog,
@@ -6,7 +6,7 @@
 //!
 //! Nothing here panics. Every step is decoded and checked again before it runs ([`crate::ops`]), so an image that
 //! changed after `parse` (a flash fault) gives [`EngineError::ImageChanged`] or, where the change is a mere number, a
-//! wrong number; it never leads outside the arena.
+//! wrong number; it never leads outside that memory.
 
 #![deny(
     clippy::indexing_slicing,
@@ -16,11 +16,12 @@
     clippy::panic
 )]
 
-use crate::image::{Image, Port, TensorRecord, known_answer};
+use crate::arena::Regions;
+use crate::image::{Image, Region, RegionName, known_answer};
 use crate::kernels::Kernels;
 use crate::ops;
 use crate::program::{KernelId, Step};
-use crate::tensor::{ElementType, index};
+use crate::tensor::{ElementType, TensorId, index};
 use crate::waypoint::{self, MAX_WAYPOINTS, Waypoint};
 use core::fmt;
 
@@ -28,15 +29,28 @@ use core::fmt;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[cfg_attr(feature = "defmt", derive(defmt::Format))]
 pub enum EngineError {
-    /// The arena has fewer bytes than the image needs.
+    /// No buffer was given for this region of the image.
+    RegionMissing(RegionName),
+    /// More buffers were given than the image has regions.
+    RegionCount {
+        /// Buffers given.
+        found: u32,
+        /// Regions of the image.
+        expected: u32,
+    },
+    /// A buffer has fewer bytes than the image needs.
     ArenaTooSmall {
-        /// Bytes of the arena.
+        /// Its region.
+        region: RegionName,
+        /// Bytes of the buffer.
         found: u32,
         /// Bytes that the image needs.
         needed: u32,
     },
-    /// The arena does not start at a multiple of the image's arena alignment.
+    /// A buffer does not start at a multiple of its region's alignment.
     ArenaMisaligned {
+        /// Its region.
+        region: RegionName,
         /// Bytes behind the last such multiple.
         remainder: u32,
         /// Alignment that the image asks for.
@@ -91,9 +105,15 @@ pub enum EngineError {
 impl fmt::Display for EngineError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::ArenaTooSmall { found, needed } => write!(f, "arena: {found} bytes, the image needs {needed}"),
-            Self::ArenaMisaligned { remainder, alignment } => {
-                write!(f, "arena: starts {remainder} bytes behind a multiple of {alignment}")
+            Self::RegionMissing(region) => write!(f, "arena {region}: no buffer was given"),
+            Self::RegionCount { found, expected } => {
+                write!(f, "{found} buffers given, the image has {expected} memory regions")
+            }
+            Self::ArenaTooSmall { region, found, needed } => {
+                write!(f, "arena {region}: {found} bytes, the image needs {needed}")
+            }
+            Self::ArenaMisaligned { region, remainder, alignment } => {
+                write!(f, "arena {region}: starts {remainder} bytes behind a multiple of {alignment}")
             }
             Self::KernelMissing(kernel) => write!(f, "the image uses kernel {kernel:?}, which this backend lacks"),
             Self::InputCount { found, expected } => write!(f, "{found} inputs given, the network has {expected}"),
@@ -129,37 +149,31 @@ pub enum Progress {
     Done,
 }
 
-/// A parsed image, a backend and an arena. `'a` is the shorter of the lives of image and arena.
+/// A parsed image, a backend and memory. `'a` is the shorter of the lives of image and memory.
 #[derive(Debug)]
 pub struct Engine<'a, K> {
     image: Image<'a>,
     kernels: K,
-    arena: &'a mut [u8],
+    regions: Regions<'a>,
     /// `None` before the first `start` and after an error.
     progress: Option<Progress>,
 }
 
 impl<'a, K: Kernels> Engine<'a, K> {
-    /// Takes the first bytes of `arena`; whatever they hold is overwritten before it is read.
+    /// `arena` is a buffer, or an array of them: one per region of the image, in its order ([`Image::regions`]). The
+    /// engine takes the first bytes of each; whatever they hold is overwritten before it is read.
     ///
     /// # Errors
-    /// The arena is too small or misaligned, or the image uses a kernel that the backend does not support.
-    pub fn new(image: Image<'a>, kernels: K, arena: &'a mut [u8]) -> Result<Self, EngineError> {
-        let needed = image.arena_bytes();
-        let found = u32::try_from(arena.len()).unwrap_or(u32::MAX);
-        let alignment = image.arena_alignment();
-        let mask = u64::from(alignment.saturating_sub(1));
-        let remainder = u32::try_from(arena.as_ptr().addr() as u64 & mask).unwrap_or(u32::MAX);
-        if remainder != 0 {
-            return Err(EngineError::ArenaMisaligned { remainder, alignment });
-        }
-        let arena = arena.get_mut(..index(needed)).ok_or(EngineError::ArenaTooSmall { found, needed })?;
+    /// A buffer is missing, surplus, too small or misaligned, or the image uses a kernel that the backend does not
+    /// support.
+    pub fn new(image: Image<'a>, kernels: K, arena: impl Into<Regions<'a>>) -> Result<Self, EngineError> {
+        let regions = take_regions(&image, arena.into())?;
         for kernel in KernelId::ALL {
             if image.features() & kernel.feature() != 0 && !kernels.supported().contains(kernel) {
                 return Err(EngineError::KernelMissing(*kernel));
             }
         }
-        Ok(Self { image, kernels, arena, progress: None })
+        Ok(Self { image, kernels, regions, progress: None })
     }
 
     /// The image.
@@ -263,8 +277,7 @@ impl<'a, K: Kernels> Engine<'a, K> {
         let number = u8::try_from(output).ok().filter(|number| *number < self.image.output_count()).ok_or(missing)?;
         let changed = EngineError::ImageChanged { step: self.image.step_count() };
         let port = self.image.output(number).ok_or(changed)?;
-        let record = self.image.tensor(port.tensor).ok_or(changed)?;
-        self.arena.get(span(&record)).ok_or(changed)
+        self.tensor(port.tensor).ok_or(changed)
     }
 
     /// The waypoints of an output, after [`Progress::Done`].
@@ -281,10 +294,10 @@ impl<'a, K: Kernels> Engine<'a, K> {
         waypoint::read(bytes).filter(|_| is_waypoints).ok_or(EngineError::NoWaypoints(number))
     }
 
-    /// The arena, for tests of the memory plan (poison in dead bytes must not change any output). Whatever is written
-    /// here can make results wrong, nothing worse.
-    pub fn arena_mut(&mut self) -> &mut [u8] {
-        self.arena
+    /// The memory, region by region, for tests of the memory plan (poison in dead bytes must not change any output).
+    /// Whatever is written here can make results wrong, nothing worse.
+    pub fn regions_mut(&mut self) -> impl Iterator<Item = &mut [u8]> {
+        self.regions.buffers_mut().map(|buffer| &mut **buffer)
     }
 
     /// Begins the self-test: the inputs follow the seeded rule of [`known_answer`].
@@ -349,7 +362,7 @@ impl<'a, K: Kernels> Engine<'a, K> {
         self.progress = None;
         let changed = EngineError::ImageChanged { step: position };
         let step = self.image.step(position).ok_or(changed)?;
-        ops::run(&step, &self.image, position, &self.kernels, self.arena).map_err(|_| changed)?;
+        ops::run(&step, &self.image, position, &self.kernels, &mut self.regions).map_err(|_| changed)?;
         let next = position.saturating_add(1);
         let done = next >= self.image.step_count();
         self.progress = Some(if done { Progress::Done } else { Progress::Running { next } });
@@ -358,18 +371,43 @@ impl<'a, K: Kernels> Engine<'a, K> {
 
     /// Output bytes of the step that ran last.
     fn written(&self, position: u16, step: &Step) -> Result<&[u8], EngineError> {
-        let record = self.image.tensor(step.output());
-        record.and_then(|record| self.arena.get(span(&record))).ok_or(EngineError::ImageChanged { step: position })
+        self.tensor(step.output()).ok_or(EngineError::ImageChanged { step: position })
+    }
+
+    fn tensor(&self, id: TensorId) -> Option<&[u8]> {
+        self.regions.tensor(&self.image.tensor(id)?)
     }
 
     fn input_slot(&mut self, input: u8) -> Result<&mut [u8], EngineError> {
-        let port: Option<Port<'_>> = self.image.input(input);
-        let record = port.and_then(|port| self.image.tensor(port.tensor));
-        record.and_then(|record| self.arena.get_mut(span(&record))).ok_or(EngineError::ImageChanged { step: 0 })
+        let record = self.image.input(input).and_then(|port| self.image.tensor(port.tensor));
+        record.and_then(|record| self.regions.tensor_mut(&record)).ok_or(EngineError::ImageChanged { step: 0 })
     }
 }
 
-/// A tensor's bytes in the arena.
-fn span(record: &TensorRecord) -> core::ops::Range<usize> {
-    index(record.offset)..index(record.offset.saturating_add(record.bytes))
+/// The first bytes of each buffer, as many as its region needs.
+fn take_regions<'a>(image: &Image<'_>, mut regions: Regions<'a>) -> Result<Regions<'a>, EngineError> {
+    let (found, expected) = (regions.count(), usize::from(image.region_count()));
+    if let Some(missing) = image.regions().nth(found) {
+        return Err(EngineError::RegionMissing(missing.name));
+    }
+    if found > expected {
+        let [found, expected] = [found, expected].map(|count| u32::try_from(count).unwrap_or(u32::MAX));
+        return Err(EngineError::RegionCount { found, expected });
+    }
+    for (buffer, region) in regions.buffers_mut().zip(image.regions()) {
+        *buffer = take_region(&region, core::mem::take(buffer))?;
+    }
+    Ok(regions)
+}
+
+fn take_region<'a>(region: &Region, buffer: &'a mut [u8]) -> Result<&'a mut [u8], EngineError> {
+    let Region { name, bytes: needed, alignment } = *region;
+    let found = u32::try_from(buffer.len()).unwrap_or(u32::MAX);
+    let mask = u64::from(alignment.saturating_sub(1));
+    let remainder = u32::try_from(buffer.as_ptr().addr() as u64 & mask).unwrap_or(u32::MAX);
+    // Nothing lies in a region of no bytes, so nothing need be aligned there.
+    if remainder != 0 && needed != 0 {
+        return Err(EngineError::ArenaMisaligned { region: name, remainder, alignment });
+    }
+    buffer.get_mut(..index(needed)).ok_or(EngineError::ArenaTooSmall { region: name, found, needed })
 }

@@ -19,6 +19,9 @@
 //! padding and is stored in the section table; the header CRC covers the table; reserved bytes are zero; the file is as
 //! long as the header says. CRCs are CRC-32/ISO-HDLC.
 //!
+//! The arena lies in one to four memory regions (tightly coupled `fast`, SRAM `main`, external `slow`), listed fastest
+//! first; one, named `main`, is the ordinary case. A tensor record names its region and its offset there.
+//!
 //! A tensor record is also the live range: `first_step` writes the tensor (0 for inputs), `last_step` reads it for the
 //! last time (the program's last step for outputs). Scratch is a record of type `Scratch` with no shape that one step
 //! uses. `in_place_of` names the operand whose memory the writing step takes over.
@@ -44,7 +47,7 @@
 //! ```
 //!
 //! At 0 magic, format 1, 1 step, length; at 0x10 features: bit 6 (requantize); at 0x18 2 tensors, 1 input, 1 output, 1
-//! region. At 0x80 the region `main`: 32 bytes, aligned to 16. At 0xC0 the section table `(kind, offset, length, CRC)`.
+//! region. At 0x80 the region `main`: 32 bytes, aligned to 16 (further regions would follow). At 0xC0 the section table `(kind, offset, length, CRC)`.
 //! At 0x17C the header CRC. At 0x180 the two ports, at 0x1C0 the two tensor records, at 0x200 the step index, at 0x210
 //! the step: variant 6, input 0, output 1, zero point 0, multiplier and shift, zero point 0, bounds −128..127.
 #![deny(
@@ -68,6 +71,8 @@ pub mod known_answer;
 pub mod layout;
 mod parse;
 mod records;
+mod region;
+mod stored;
 
 pub(crate) use checker::Cursor;
 pub use checker::{CheckError, CheckProgress, Checker, crc32};
@@ -76,6 +81,8 @@ pub use checks::{Check, ParseError, Place};
 pub(crate) use checks::{ensure, ensure_equal, shown};
 pub use known_answer::KnownAnswer;
 pub use records::{Port, TensorRecord, text};
+pub use region::{Region, RegionName};
+pub use stored::StoredImage;
 
 /// A section of the file; the number is its slot in the header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -143,12 +150,12 @@ pub struct Image<'a> {
     bytes: &'a [u8],
     sections: [Section; layout::SECTIONS],
     features: u64,
-    arena_bytes: u32,
-    arena_alignment: u32,
+    regions: [Region; layout::REGION_SLOTS],
     step_count: u16,
     tensor_count: u16,
     input_count: u8,
     output_count: u8,
+    region_count: u8,
     work: u64,
 }
 
@@ -212,14 +219,29 @@ impl<'a> Image<'a> {
         self.features
     }
 
-    /// Bytes of arena that an [`crate::engine::Engine`] needs.
-    pub fn arena_bytes(&self) -> u32 {
-        self.arena_bytes
+    /// The memory regions, fastest first: an [`crate::engine::Engine`] needs a buffer in each, in this order.
+    pub fn regions(&self) -> impl Iterator<Item = Region> + '_ {
+        self.regions.iter().take(self.region_count.into()).copied()
     }
 
-    /// Alignment that the arena needs.
+    /// A memory region, by position; `None` behind the last.
+    pub fn region(&self, region: u8) -> Option<Region> {
+        self.regions().nth(region.into())
+    }
+
+    /// Number of memory regions, at least one.
+    pub fn region_count(&self) -> u8 {
+        self.region_count
+    }
+
+    /// Bytes of arena that an [`crate::engine::Engine`] needs, in all regions together.
+    pub fn arena_bytes(&self) -> u32 {
+        self.regions().fold(0, |sum, region| sum.saturating_add(region.bytes))
+    }
+
+    /// The largest alignment that a region needs.
     pub fn arena_alignment(&self) -> u32 {
-        self.arena_alignment
+        self.regions().map(|region| region.alignment).max().unwrap_or_default()
     }
 
     /// Number of steps.

@@ -18,7 +18,7 @@
     clippy::panic
 )]
 
-use crate::arena::Changed;
+use crate::arena::{Changed, Regions};
 use crate::image::{Image, ParseError};
 use crate::kernels::Kernels;
 use crate::program::Step;
@@ -74,18 +74,18 @@ pub(crate) fn validate(step: &Step, context: &StepContext<'_, '_>) -> Result<u64
     }
 }
 
-/// Validates a step and runs it in the arena.
+/// Validates a step and runs it in the memory regions.
 pub(crate) fn run<K: Kernels>(
     step: &Step,
     image: &Image<'_>,
     position: u16,
     kernels: &K,
-    arena: &mut [u8],
+    regions: &mut Regions<'_>,
 ) -> Result<(), Changed> {
     let context = StepContext { image, position };
     context.check_operands(step)?;
     validate(step, &context)?;
-    let operands = context.operands(step, arena)?;
+    let operands = context.operands(step, regions)?;
     match step {
         Step::Conv2d(step) => conv2d::run(step, &context, kernels, operands),
         Step::Linear(step) => linear::run(step, &context, kernels, operands),

@@ -68,22 +68,23 @@
 //! | unit | content | written |
 //! |---|---|---|
 //! | 0 | claim: [`CLAIM`] | after the sector was erased, before the image's sectors are |
-//! | 1 | `u32` counter, `u32` bytes of the image, `u32` CRC of its header, `u32` CRC of these 12 bytes | last, by [`Updater::finish`] |
+//! | 1 | counter, bytes of the image, CRC of its header, CRC of these 12 bytes (`u32` each) | by [`Updater::finish`] |
 //! | 2, 4, 6 | tried: [`TRIED`] | when a start takes the image on trial |
 //! | 3, 5, 7 | confirmed: [`CONFIRMED`] | by [`Updater::confirm`] during that trial |
 //!
 //! Why this is enough: a slot with a claim runs only if its record is whole, so what a broken-off update left behind
-//! never runs; where the claim is torn or missing, the image is one that nothing has touched yet, or has lost its header
-//! (which the next update erases before it renews the claim). A record is believed only with its CRC, and its image only
-//! after every byte of it was checked. Counters are compared as serial numbers, so that they may wrap. A trial counts
-//! when any bit of its mark is written, a confirmation only when all are: a mark torn by a power cut costs one trial,
-//! and the next start has another. A unit that cannot be read (an error-correcting code that a torn write left wrong)
-//! counts as written, but holds nothing.
+//! never runs. While a record is erased, it may say anything; but then the image is one that nothing has touched yet,
+//! or it has lost its header: an update that finds what must not run erases that first. A record is believed only with
+//! its CRC, and its image only after every byte of it was checked. Counters are compared as serial numbers, so that
+//! they may wrap. A trial counts when any bit of its mark is written, a confirmation only when all are: a mark torn by
+//! a power cut costs one trial, and the next start has another. A unit that cannot be read (an error-correcting code
+//! that a torn write left wrong) counts as written, but holds nothing.
 //!
 //! # What an update refuses
 //!
-//! See [`Refusal`]: an image that is too large, for another target (neither the board's nor `portable`), with features, kernels or memory that the board does
-//! not have, with another interface than the application needs, with a lower revision than the running one's, or
+//! See [`Refusal`]: an image that is too large, for another target than the board's or `portable`, with features,
+//! kernels or memory that the board does not have, with another interface than the application needs, with a lower
+//! revision than the running one's, or
 //! damaged. The same revision is accepted if the image differs (a rebuild); the very image that runs is refused, as
 //! there is nothing to do. Most of it is known from the [`Manifest`], before a sector is erased.
 //!

@@ -113,7 +113,7 @@ struct Bench<'a> {
 impl<'a> Bench<'a> {
     fn new(image: Image<'a>) -> Self {
         let seed = image.known_answer().map_or(SEED, |answer| answer.seed());
-        let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
+        let arena = GuardedArena::new(&image);
         Self { image, inputs: seeded_inputs(&image, seed), arena }
     }
 

@@ -133,7 +133,7 @@ fn quantized(bundle: &Bundle, graph: &Graph, progress: &ProgressBar, say: &mut d
 
 fn compiled_for(compiled: &Compiled) -> String {
     let (record, plan) = (&compiled.record, &compiled.record.plan);
-    format!("compile    for {}: image {} B, arena {} B", record.target, compiled.image.len(), plan.arena_bytes)
+    format!("compile    for {}: image {} B, arena {} B", record.target, compiled.image.len(), plan.arena_bytes())
 }
 
 fn verified(bundle: &Bundle, image: PathBuf, progress: &ProgressBar) -> Result<Verified> {

@@ -49,7 +49,7 @@ pub struct Gates {
     pub min_agreement_percent: Option<f64>,
     /// Fewest frames on which the class is the label, percent.
     pub min_top1_percent: Option<f64>,
-    /// Largest arena.
+    /// Largest arena, all memory regions together.
     pub max_arena_bytes: Option<u64>,
     /// Largest image.
     pub max_flash_bytes: Option<u64>,

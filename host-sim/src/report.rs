@@ -112,7 +112,7 @@ pub struct Summary {
     /// Distance of point k from the f32 network's, pixels.
     #[serde(default)]
     pub point_error_px: Vec<MeanAndMax>,
-    /// Size of the arena, bytes.
+    /// Size of the arena in all memory regions together, bytes.
     pub arena_bytes: u64,
     /// Its lower bound, bytes.
     pub arena_bound_bytes: u64,

@@ -274,7 +274,7 @@ impl<'a> Device<'a> {
             let place = format!("network {}", image.name());
             return Err(Error::new(ErrorCode::Unsupported, place, "it has no output"));
         }
-        let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
+        let arena = GuardedArena::new(&image);
         Ok(Self { image, backend, arena, outputs })
     }
 

@@ -1,13 +1,13 @@
 //! A network of two steps in all its forms, for tests: camera 4×4 → max pool 2×2 → average pool, a vector of three.
 
-use firmware::image::TensorRecord;
+use firmware::image::{Region, RegionName, TensorRecord};
 use firmware::program::{self, Clamp, Requant, Step, Window};
 use firmware::tensor::{ElementType, Shape, TensorId};
 use model_compiler::artifact;
 use model_compiler::emit::{AlignedBytes, ImageParts, ImagePort, emit};
 use model_compiler::frames::{ByteMap, Frame};
 use model_compiler::ir::{Graph, InputKind, Op};
-use model_compiler::memory_plan::{MemoryPlan, Placement, PlanStatus};
+use model_compiler::memory_plan::{ArenaPart, MemoryPlan, Placement, PlanStatus};
 use model_compiler::qmodel::{Bounds, Port, QModel, QOp, QStep, QTensor, QTensorId};
 use model_compiler::record::Record;
 
@@ -38,10 +38,15 @@ pub fn sample() -> Sample {
             tensors: vec![placement(0, 48, 0, 0), placement(48, 12, 0, 1), placement(64, 6, 1, 1)],
             scratch: vec![None, None],
             kernels: vec![None, None],
-            arena_bytes: 80,
-            bound_bytes: 64,
-            peak_step: 0,
-            status: PlanStatus::OptimalBoundNotReachable,
+            regions: vec![ArenaPart {
+                name: "main".into(),
+                capacity: None,
+                bytes: 80,
+                bound_bytes: 64,
+                peak_step: 0,
+                status: PlanStatus::OptimalBoundNotReachable,
+                traffic_bytes: 144,
+            }],
             nodes: 1,
             alignment: 16,
         },
@@ -107,6 +112,7 @@ fn image_parts() -> ImageParts {
     let record = |element, shape, offset, bytes, first_step, last_step| TensorRecord {
         element,
         shape,
+        region: 0,
         offset,
         bytes,
         first_step,
@@ -138,8 +144,7 @@ fn image_parts() -> ImageParts {
         constants: vec![],
         inputs: vec![port("rgb", 0, 1.0, -128)],
         outputs: vec![port("mean", 2, MEAN_SCALE as f32, 0)],
-        arena_bytes: 80,
-        arena_alignment: 16,
+        regions: vec![Region { name: RegionName::MAIN, bytes: 80, alignment: 16 }],
         target: String::new(),
         revision: 0,
         qmodel_digest: [0; 32],
@@ -149,5 +154,5 @@ fn image_parts() -> ImageParts {
 }
 
 fn placement(offset: u64, bytes: u64, first_step: u32, last_step: u32) -> Placement {
-    Placement { offset, bytes, first_step, last_step, in_place_of: None }
+    Placement { region: 0, offset, bytes, first_step, last_step, in_place_of: None }
 }

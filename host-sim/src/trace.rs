@@ -119,7 +119,7 @@ impl<'a> Tracer<'a> {
     pub fn new(image: Image<'a>, record: &'a Record, graph: Option<&'a Graph>, backend: Backend) -> Result<Self> {
         check_record(&image, record)?;
         let reference = graph.map(|graph| FloatNetwork::new(graph, &record.model)).transpose()?;
-        let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
+        let arena = GuardedArena::new(&image);
         let figures = |&step: &u32| StepFigures {
             equal: true,
             channels: Channels::of(&record.model, &record.model.steps[step as usize].op),
@@ -401,8 +401,13 @@ fn check_record(image: &Image<'_>, record: &Record) -> Result<()> {
         ("steps", u64::from(image.step_count()), plan.order.len() as u64),
         ("inputs", u64::from(image.input_count()), model.inputs.len() as u64),
         ("outputs", u64::from(image.output_count()), model.outputs.len() as u64),
-        ("bytes of arena", u64::from(image.arena_bytes()), plan.arena_bytes),
-    ];
+        ("memory regions", u64::from(image.region_count()), plan.regions.len() as u64),
+    ]
+    .map(|(what, image, record)| (what.to_owned(), image, record));
+    let regions = image.regions().zip(&plan.regions);
+    let bytes =
+        regions.map(|(region, part)| (format!("bytes in region {}", part.name), region.bytes.into(), part.bytes));
+    let pairs: Vec<(String, u64, u64)> = pairs.into_iter().chain(bytes).collect();
     match pairs.iter().find(|(_, image, record)| image != record) {
         None => Ok(()),
         Some((what, image, record)) => {

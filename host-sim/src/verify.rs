@@ -306,9 +306,9 @@ fn summary(record: &Record, steps: &[StepReport], waypoint_errors: &[Spread], po
         waypoint_error_mm: means_and_maxima(waypoint_errors),
         control_error: Vec::new(),
         point_error_px: means_and_maxima(point_errors),
-        arena_bytes: plan.arena_bytes,
-        arena_bound_bytes: plan.bound_bytes,
-        arena_status: plan.status,
+        arena_bytes: plan.arena_bytes(),
+        arena_bound_bytes: plan.bound_bytes(),
+        arena_status: plan.status(),
         flash_bytes: 0,
         accuracy: None,
     }
@@ -385,9 +385,9 @@ mod tests {
         let error = compare_sample(&sample(), Some(&other), &[frame(0)]).unwrap_err();
         assert!(error.to_string().contains("it has no value pool"), "{error}");
         let mut bigger = sample();
-        bigger.record.plan.arena_bytes += 16;
+        bigger.record.plan.regions[0].bytes += 16;
         let error = compare_sample(&bigger, None, &[frame(0)]).unwrap_err();
-        assert_eq!(error.message, "the image has 80 bytes of arena, the record 96");
+        assert_eq!(error.message, "the image has 80 bytes in region main, the record 96");
         let blind = Frame { rgb: None, ..frame(0) };
         assert_eq!(compare_sample(&sample(), None, &[blind]).unwrap_err().code, ErrorCode::Frames);
     }

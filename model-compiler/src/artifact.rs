@@ -10,8 +10,6 @@ use std::path::Path;
 use tempfile::NamedTempFile;
 
 const HEADER_BYTES: usize = 48;
-/// Rises whenever a stored structure changes.
-const FORMAT: u32 = 2;
 
 /// A kind of sealed file.
 pub trait Artifact: Serialize + DeserializeOwned {
@@ -19,16 +17,20 @@ pub trait Artifact: Serialize + DeserializeOwned {
     const MAGIC: [u8; 8];
     /// What messages call it.
     const KIND: &'static str;
+    /// Rises whenever the stored structure changes.
+    const FORMAT: u32;
 }
 
 impl Artifact for crate::qmodel::QModel {
     const MAGIC: [u8; 8] = *b"QMODEL\r\n";
     const KIND: &'static str = "quantized model";
+    const FORMAT: u32 = 2;
 }
 
 impl Artifact for crate::record::Record {
     const MAGIC: [u8; 8] = *b"QRECORD\n";
     const KIND: &'static str = "build record";
+    const FORMAT: u32 = 3;
 }
 
 /// SHA-256 of some bytes.
@@ -50,7 +52,7 @@ pub fn to_bytes<T: Artifact>(artifact: &T) -> Result<Vec<u8>> {
         .map_err(|e| Error::new(ErrorCode::Malformed, "", format!("{} cannot be stored: {e}", T::KIND)))?;
     let mut bytes = Vec::with_capacity(HEADER_BYTES + payload.len());
     bytes.extend_from_slice(&T::MAGIC);
-    bytes.extend_from_slice(&FORMAT.to_le_bytes());
+    bytes.extend_from_slice(&T::FORMAT.to_le_bytes());
     bytes.extend_from_slice(&[0; 4]);
     bytes.extend_from_slice(&sha256(&payload));
     bytes.extend_from_slice(&payload);
@@ -69,8 +71,9 @@ pub fn from_bytes<T: Artifact>(bytes: &[u8]) -> Result<T> {
         return Err(malformed(format!("this is not a {}", T::KIND)));
     }
     let format = u32::from_le_bytes([bytes[8], bytes[9], bytes[10], bytes[11]]);
-    if format != FORMAT {
-        return Err(malformed(format!("format of the {}: found {format}, expected {FORMAT}", T::KIND)));
+    if format != T::FORMAT {
+        let (kind, expected) = (T::KIND, T::FORMAT);
+        return Err(malformed(format!("format of the {kind}: found {format}, expected {expected}")));
     }
     let payload = &bytes[HEADER_BYTES..];
     if bytes[16..HEADER_BYTES] != sha256(payload) || bytes[12..16] != [0; 4] {

@@ -1,4 +1,4 @@
-//! The command line: `quantize`, `compile`, `inspect`, `completions`.
+//! The command line: `quantize`, `compile`, `convert`, `inspect`, `completions`.
 //!
 //! Results go to stdout, everything else to stderr. Exit status: 0 success, 1 a check failed, 2 bad input or usage.
 
@@ -12,7 +12,7 @@ use crate::passes::PassOptions;
 use crate::pipeline;
 use crate::qmodel::QModel;
 use crate::quantize::{QuantizeOptions, RangeRule, SkipStages};
-use crate::target::{Target, parse_size};
+use crate::target::{Region, Target, parse_size};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use std::ffi::OsString;
 use std::fmt::Write as _;
@@ -20,12 +20,15 @@ use std::path::{Path, PathBuf};
 
 mod completions;
 mod console;
+mod convert;
+mod diff;
 mod examples;
 mod inspect;
 mod progress;
 
 pub use completions::CompletionArgs;
 pub use console::Console;
+use convert::FormArgs;
 use progress::Bar;
 pub use progress::progress_bar;
 
@@ -62,8 +65,21 @@ enum Command {
         /// Revision of the model: an update in the field refuses a lower one than it runs.
         #[arg(long, default_value_t = 0, value_name = "N")]
         revision: u32,
+        #[command(flatten)]
+        forms: FormArgs,
         /// Output file; the record gets the same name with the extension .record.
         #[arg(short, long, value_name = "OUT.img")]
+        output: PathBuf,
+    },
+    /// Model image in another form: Intel HEX, S-records, ELF object, Rust source.
+    #[command(after_help = examples::CONVERT)]
+    Convert {
+        /// Model image (.img).
+        image: PathBuf,
+        #[command(flatten)]
+        forms: FormArgs,
+        /// Output file.
+        #[arg(short, long, value_name = "OUT")]
         output: PathBuf,
     },
     /// What is in a file: image, quantized model, checkpoint or ONNX file.
@@ -71,6 +87,12 @@ enum Command {
     Inspect {
         /// The file.
         file: PathBuf,
+        /// Earlier image: say what changed from it to the file. Exit status 1 where they are not equal.
+        #[arg(long, value_name = "BEFORE.img")]
+        diff: Option<PathBuf>,
+        /// The changes as JSON.
+        #[arg(long, requires = "diff")]
+        json: bool,
     },
     /// Script that completes commands and options in a shell.
     #[command(after_help = examples::COMPLETIONS)]
@@ -198,14 +220,24 @@ fn size(text: &str) -> std::result::Result<u64, String> {
     parse_size(text).map_err(|e| format!("{}, {}", e.message, e.help))
 }
 
+/// `NAME=BYTES`; names are judged where the regions meet.
+fn region(text: &str) -> std::result::Result<Region, String> {
+    let (name, bytes) = text.split_once('=').ok_or_else(|| format!("found {text:?}, expected NAME=BYTES"))?;
+    Ok(Region { name: name.into(), bytes: Some(size(bytes)?) })
+}
+
 #[derive(Debug, Args)]
 struct TargetArgs {
     /// Built-in target name, or a .toml file that describes one.
     #[arg(long, default_value = "portable", value_name = "NAME|FILE.toml")]
     target: String,
     /// RAM for the arena: bytes, or with K or M.
-    #[arg(long, value_name = "BYTES", value_parser = size)]
+    #[arg(long, value_name = "BYTES", value_parser = size, conflicts_with = "region")]
     ram: Option<u64>,
+    /// A memory for the arena, instead of the target's: name and bytes (or with K or M). Give up to four, the fastest
+    /// first: the hottest buffers go there.
+    #[arg(long, value_name = "NAME=BYTES", value_parser = region)]
+    region: Vec<Region>,
     /// Flash for the image: bytes, or with K or M.
     #[arg(long, value_name = "BYTES", value_parser = size)]
     flash: Option<u64>,
@@ -277,7 +309,16 @@ impl QuantizeArgs {
 
 impl TargetArgs {
     fn target(&self) -> Result<Target> {
-        Ok(Target::find(&self.target)?.with_limits(self.ram, self.flash))
+        let mut target = Target::find(&self.target)?;
+        if !self.region.is_empty() {
+            target = target.with_regions(self.region.clone())?;
+        }
+        if self.ram.is_some() && target.regions.len() > 1 {
+            let names: Vec<String> = target.regions.iter().map(|r| format!("--region {}=BYTES", r.name)).collect();
+            let message = format!("target {} has {} memories, --ram is the size of one", target.name, names.len());
+            return Err(Error::new(ErrorCode::Usage, "--ram", message).with_help(format!("use {}", names.join(" "))));
+        }
+        Ok(target.with_limits(self.ram, self.flash))
     }
 
     fn plan_options(&self, target: &Target) -> PlanOptions {
@@ -302,9 +343,9 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
     let result = cli.command.execute(&mut bar, &mut console);
     bar.finish();
     match result {
-        Ok(text) => {
+        Ok((text, status)) => {
             console.print(&text);
-            0
+            status
         }
         Err(error) => {
             console.complain(&format!("error: {error}"));
@@ -314,16 +355,20 @@ pub fn main(arguments: impl IntoIterator<Item = OsString>, mut console: Console<
 }
 
 impl Command {
-    /// Runs the command; what it has to say is for standard output. Nothing half-written is left behind.
-    fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<String> {
-        match self {
+    /// Runs the command; what it has to say is for standard output, its number the exit status. Nothing half-written is
+    /// left behind.
+    fn execute(&self, bar: &mut Bar, console: &mut Console<'_>) -> Result<(String, u8)> {
+        let done = match self {
+            Self::Inspect { file, diff: Some(before), json } => return diff::run(before, file, *json),
             Self::Quantize { model, quantize, output } => run_quantize(model, quantize, output, bar),
-            Self::Compile { model, quantize, target, revision, output } => {
-                run_compile(model, quantize, target, *revision, output, bar, console)
+            Self::Compile { model, quantize, target, revision, forms, output } => {
+                run_compile(model, quantize, target, *revision, (forms, output), bar, console)
             }
-            Self::Inspect { file } => inspect::inspect(file),
+            Self::Convert { image, forms, output } => convert::run(image, forms, output),
+            Self::Inspect { file, .. } => inspect::inspect(file),
             Self::Completions(shell) => Ok(shell.script::<Cli>()),
-        }
+        };
+        done.map(|text| (text, 0))
     }
 }
 
@@ -344,17 +389,20 @@ fn run_compile(
     quantize: &QuantizeArgs,
     target: &TargetArgs,
     revision: u32,
-    output: &Path,
+    (forms, output): (&FormArgs, &Path),
     bar: &mut Bar,
     console: &mut Console<'_>,
 ) -> Result<String> {
-    check_output(output, model)?;
+    forms.check()?;
+    let image_path = forms.image_path(output)?;
     let record = pipeline::record_path(output);
     if record == output {
         let error = Error::new(ErrorCode::Usage, output.display().to_string(), "this name is for the record");
         return Err(error.with_help("give the image another extension, such as .img"));
     }
-    check_output(&record, model)?;
+    let beside = Some(image_path.clone()).filter(|path| path != output);
+    let outputs = [forms.paths(output), vec![record], beside.into_iter().collect()].concat();
+    convert::check_outputs(&outputs, model)?;
     let target_data = target.target()?;
     let quantized = if is_quantized(model)? {
         if quantize.calib.is_some() {
@@ -367,7 +415,10 @@ fn run_compile(
     let options = target.plan_options(&target_data);
     let compiled = pipeline::compile(&quantized, &target_data, &options, &mut |s, d, t| bar.show(s, d, t));
     let compiled = compiled.and_then(|c| c.with_revision(revision)).map_err(|e| e.within(model.display()))?;
-    pipeline::write(&compiled, output)?;
+    let files = forms.files(&compiled.image, output)?;
+    let others = files.iter().map(|(path, bytes)| (path.as_path(), bytes.as_slice()));
+    let others: Vec<_> = others.filter(|(path, _)| *path != image_path).collect();
+    pipeline::write_with(&compiled, &image_path, &others)?;
     let mut text = String::new();
     for (key, value) in pipeline::summary(&compiled) {
         let _ = writeln!(text, "{key:>8}  {value}");

@@ -2,9 +2,10 @@
 //! that is not named in [`firmware::image::layout`].
 
 use crate::error::{Error, ErrorCode, Result};
+use firmware::arena::Regions;
 use firmware::image::audit::audit;
 use firmware::image::layout::{self, header, region, section};
-use firmware::image::{Image, Port, SectionKind, TensorRecord, crc32};
+use firmware::image::{Image, Port, Region, SectionKind, TensorRecord, crc32};
 use firmware::program::{ConstRange, Step};
 use firmware::tensor::TensorId;
 use std::collections::HashMap;
@@ -25,10 +26,8 @@ pub struct ImageParts {
     pub inputs: Vec<ImagePort>,
     /// Outputs in header order.
     pub outputs: Vec<ImagePort>,
-    /// Size of the arena, bytes.
-    pub arena_bytes: u32,
-    /// Alignment of the arena: a power of two, 16..=4096.
-    pub arena_alignment: u32,
+    /// The memory regions, fastest first: one to four, of distinct names.
+    pub regions: Vec<Region>,
     /// Target that the image is compiled for, at most 16 bytes of visible ASCII; empty where unknown.
     pub target: String,
     /// Revision of the model: what an update compares.
@@ -98,6 +97,12 @@ impl Deref for AlignedBytes {
 impl DerefMut for AlignedBytes {
     fn deref_mut(&mut self) -> &mut [u8] {
         &mut bytemuck::cast_slice_mut(&mut self.words)[..self.length]
+    }
+}
+
+impl<'a> From<&'a mut AlignedBytes> for Regions<'a> {
+    fn from(buffer: &'a mut AlignedBytes) -> Self {
+        (&mut buffer[..]).into()
     }
 }
 
@@ -229,8 +234,6 @@ fn write_header(bytes: &mut [u8], parts: &ImageParts) -> Result<()> {
         .steps
         .iter()
         .fold(0, |bits, step| bits | step.feature() | step.kernel().map_or(0, |kernel| kernel.feature()));
-    let main = header::REGIONS.start;
-    let at = |range: Range<usize>| main + range.start..main + range.end;
     bytes[header::MAGIC].copy_from_slice(&layout::MAGIC);
     bytes[header::FORMAT].copy_from_slice(&layout::FORMAT.to_le_bytes());
     bytes[header::STEP_COUNT].copy_from_slice(&count::<u16>(parts.steps.len(), "steps")?.to_le_bytes());
@@ -238,7 +241,7 @@ fn write_header(bytes: &mut [u8], parts: &ImageParts) -> Result<()> {
     bytes[header::TENSOR_COUNT].copy_from_slice(&count::<u16>(parts.tensors.len(), "tensors")?.to_le_bytes());
     bytes[header::INPUT_COUNT].copy_from_slice(&[count(parts.inputs.len(), "inputs")?]);
     bytes[header::OUTPUT_COUNT].copy_from_slice(&[count(parts.outputs.len(), "outputs")?]);
-    bytes[header::REGION_COUNT].copy_from_slice(&[1]);
+    bytes[header::REGION_COUNT].copy_from_slice(&[count(parts.regions.len(), "memory regions")?]);
     let name = bytes[header::NAME].get_mut(..parts.name.len());
     name.ok_or_else(|| malformed(&parts.name, "the model name is longer than 32 bytes"))?
         .copy_from_slice(parts.name.as_bytes());
@@ -249,9 +252,15 @@ fn write_header(bytes: &mut [u8], parts: &ImageParts) -> Result<()> {
     bytes[header::REVISION].copy_from_slice(&parts.revision.to_le_bytes());
     bytes[header::QMODEL_DIGEST].copy_from_slice(&parts.qmodel_digest);
     bytes[header::BUILD_DIGEST].copy_from_slice(&parts.build_digest);
-    bytes[at(region::NAME)].copy_from_slice(&region::MAIN);
-    bytes[at(region::ARENA_BYTES)].copy_from_slice(&parts.arena_bytes.to_le_bytes());
-    bytes[at(region::ALIGNMENT)].copy_from_slice(&parts.arena_alignment.to_le_bytes());
+    let slots = bytes[header::REGIONS].chunks_exact_mut(region::BYTES);
+    if parts.regions.len() > slots.len() {
+        return Err(malformed(&parts.name, format!("more than {} memory regions", layout::REGION_SLOTS)));
+    }
+    for (slot, memory) in slots.zip(&parts.regions) {
+        slot[region::NAME].copy_from_slice(&memory.name.to_bytes());
+        slot[region::ARENA_BYTES].copy_from_slice(&memory.bytes.to_le_bytes());
+        slot[region::ALIGNMENT].copy_from_slice(&memory.alignment.to_le_bytes());
+    }
     Ok(())
 }
 

@@ -5,11 +5,11 @@
 use crate::artifact;
 use crate::emit::{ConstantsBuilder, ImageParts, ImagePort};
 use crate::error::{Error, ErrorCode, Result};
-use crate::memory_plan::{MemoryPlan, Placement};
+use crate::memory_plan::{ArenaPart, MemoryPlan, Placement};
 use crate::qmodel::{
     Port, QConcatSource, QModel, QOp, QRescale, QResidual, QTensorId, QTerm, QTokenSource, QWaypointDecoder,
 };
-use firmware::image::TensorRecord;
+use firmware::image::{Region, RegionName, TensorRecord};
 use firmware::kernels::{k4n16, plan};
 use firmware::program::{
     Add, Attention, AveragePool, BranchLinear, Concat, ConcatSource, ConstRange, Conv2d, CopyBox, GatherSum,
@@ -18,7 +18,7 @@ use firmware::program::{
 };
 use firmware::tensor::TensorId;
 
-/// Alignment of the arena itself: enough for every kernel's loads.
+/// Alignment of the arena in each region: enough for every kernel's loads.
 const ARENA_ALIGNMENT: u32 = 16;
 
 /// Packs a model along its plan.
@@ -31,6 +31,7 @@ pub fn pack(model: &QModel, memory: &MemoryPlan) -> Result<ImageParts> {
         let record = TensorRecord {
             element: tensor.element,
             shape: tensor.shape,
+            region: placement.region,
             offset: narrow(placement.offset, "arena offset")?,
             bytes: narrow(placement.bytes, "tensor bytes")?,
             first_step: narrow(placement.first_step, "steps")?,
@@ -53,8 +54,7 @@ pub fn pack(model: &QModel, memory: &MemoryPlan) -> Result<ImageParts> {
         constants: packer.constants.finish(),
         inputs: ports(&model.inputs)?,
         outputs: ports(&model.outputs)?,
-        arena_bytes: narrow(memory.arena_bytes, "arena bytes")?,
-        arena_alignment: ARENA_ALIGNMENT.max(memory.alignment),
+        regions: memory.regions.iter().map(|part| region(part, memory.alignment)).collect::<Result<_>>()?,
         target: String::new(),
         revision: 0,
         qmodel_digest: artifact::sha256(&artifact::to_bytes(model)?),
@@ -82,6 +82,14 @@ fn image_port(model: &QModel, port: &Port) -> Result<ImagePort> {
     })
 }
 
+fn region(part: &ArenaPart, alignment: u32) -> Result<Region> {
+    let name = RegionName::new(&part.name).ok_or_else(|| {
+        let message = format!("region {:?} needs a name of 1 to 8 visible ASCII characters", part.name);
+        Error::new(ErrorCode::Usage, "image", message)
+    })?;
+    Ok(Region { name, bytes: narrow(part.bytes, "arena bytes")?, alignment: ARENA_ALIGNMENT.max(alignment) })
+}
+
 fn term(term: &QTerm) -> Result<Term> {
     Ok(Term { tensor: tensor_id(term.tensor)?, zero_point: term.zero_point, multiplier: term.multiplier })
 }
@@ -104,11 +112,12 @@ struct Packer {
 impl Packer {
     fn scratch(&mut self, position: usize, placement: Option<Placement>) -> Result<Option<TensorId>> {
         let Some(placement) = placement else { return Ok(None) };
-        let record = TensorRecord::scratch(
+        let scratch = TensorRecord::scratch(
             narrow(placement.offset, "arena offset")?,
             narrow(placement.bytes, "scratch bytes")?,
             narrow(position, "steps")?,
         );
+        let record = TensorRecord { region: placement.region, ..scratch };
         let id = TensorId(narrow(self.tensors.len(), "tensors")?);
         self.tensors.push(record);
         Ok(Some(id))

@@ -126,8 +126,19 @@ pub fn compile(model: &QModel, target: &Target, options: &PlanOptions, progress:
 /// # Errors
 /// A file cannot be written; then neither is left half-written, nor one without the other.
 pub fn write(compiled: &Compiled, image_path: &Path) -> Result<()> {
-    let record = artifact::to_bytes(&compiled.record)?;
-    artifact::write_files(&[(&record_path(image_path), &record), (image_path, &compiled.image)])
+    write_with(compiled, image_path, &[])
+}
+
+/// Writes `OUT.img`, `OUT.record` and other files that belong to them.
+///
+/// # Errors
+/// A file cannot be written; then none is left half-written, nor one without the others.
+pub fn write_with(compiled: &Compiled, image_path: &Path, others: &[(&Path, &[u8])]) -> Result<()> {
+    let (record, record_path) = (artifact::to_bytes(&compiled.record)?, record_path(image_path));
+    let mut files = vec![(record_path.as_path(), record.as_slice())];
+    files.extend_from_slice(others);
+    files.push((image_path, &compiled.image));
+    artifact::write_files(&files)
 }
 
 /// The record that belongs to an image: the same name with the extension `record`.
@@ -139,7 +150,7 @@ pub fn record_path(image_path: &Path) -> std::path::PathBuf {
 pub fn summary(compiled: &Compiled) -> Vec<(String, String)> {
     let (model, plan) = (&compiled.record.model, &compiled.record.plan);
     let weights = model.steps.iter().map(|s| s.op.weight_bytes()).sum::<u64>();
-    vec![
+    let mut facts = vec![
         ("model".into(), format!("{} ({})", model.name, model.system)),
         ("target".into(), compiled.record.target.clone()),
         ("steps".into(), model.steps.len().to_string()),
@@ -156,18 +167,26 @@ pub fn summary(compiled: &Compiled) -> Vec<(String, String)> {
             "arena".into(),
             format!(
                 "{} B ({:.3} MiB), bound {} B: {}",
-                plan.arena_bytes,
-                mib(plan.arena_bytes),
-                plan.bound_bytes,
-                plan.status.words()
+                plan.arena_bytes(),
+                mib(plan.arena_bytes()),
+                plan.bound_bytes(),
+                plan.status().words()
             ),
         ),
-        (
-            "peak".into(),
-            format!("step {} {}", plan.peak_step, model.steps[plan.order[plan.peak_step as usize] as usize].name),
-        ),
-        ("sha256".into(), hex(&compiled.record.image_sha256)),
-    ]
+    ];
+    let step = |position: u32| format!("step {position} {}", model.steps[plan.order[position as usize] as usize].name);
+    match plan.regions.as_slice() {
+        [only] => facts.push(("peak".into(), step(only.peak_step))),
+        parts => facts.extend(parts.iter().map(|part| {
+            let of = part.capacity.map(|capacity| format!(" of {capacity} B")).unwrap_or_default();
+            let share = 100.0 * plan.traffic_share(part);
+            let (bytes, bound, status) = (part.bytes, part.bound_bytes, part.status.words());
+            let text = format!("{bytes} B{of}, bound {bound} B: {status}; {share:.1} % of the traffic");
+            (part.name.clone(), format!("{text}; peak {}", step(part.peak_step)))
+        })),
+    }
+    facts.push(("sha256".into(), hex(&compiled.record.image_sha256)));
+    facts
 }
 
 fn mib(bytes: u64) -> f64 {

@@ -195,6 +195,8 @@ mod tests {
             writes: (2..tensors).collect(),
             kernels: vec![None; steps],
             scratch: (0..steps).map(|_| 16 * below(2) as u64).collect(),
+            tensor_traffic: bytes,
+            scratch_traffic: vec![0; steps],
             reads,
             alignment: 16,
         }

@@ -1,6 +1,6 @@
 //! Targets: what a plan must fit, as data. A new chip is a new description, not new code.
 //!
-//! Built in are families without sizes; `--ram` and `--flash` or a TOML file add them:
+//! Built in are families without sizes; `--ram` or `--region`, and `--flash`, or a TOML file add them:
 //!
 //! ```toml
 //! name = "my-board"        # at most 16 visible ASCII characters; the image carries it
@@ -8,15 +8,16 @@
 //! flash = "2M"             # bytes, or with K or M (1024, 1024²); absent: unlimited
 //! kernels = ["direct"]     # or "k4n16": what the runtime there has, the best first; absent: direct
 //!
-//! [[regions]]              # RAM; the arena lies in the first
+//! [[regions]]              # RAM, one to four memories, the fastest first
 //! name = "main"
-//! bytes = "1536K"
+//! bytes = "1536K"          # absent: unlimited
 //! ```
 
 use crate::error::{Error, ErrorCode, Result};
-use crate::memory_plan::{MemoryPlan, PlanStatus};
+use crate::memory_plan::{ArenaPart, MemoryPlan, PlanStatus};
 use crate::qmodel::QModel;
 use firmware::image::layout::header;
+use firmware::image::{RegionName, layout};
 use firmware::kernels::plan;
 use firmware::program::KernelId;
 use serde::Deserialize;
@@ -28,7 +29,7 @@ use std::path::Path;
 pub struct Target {
     /// Name in messages and records.
     pub name: String,
-    /// RAM, at least one region; the arena lies in the first.
+    /// RAM: one to four regions of distinct names, the fastest first; the arena is spread over them.
     pub regions: Vec<Region>,
     /// Room for the image, bytes; `None`: unlimited.
     pub flash_bytes: Option<u64>,
@@ -41,7 +42,7 @@ pub struct Target {
 /// A named memory.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Region {
-    /// `main`, `fast`, `slow`.
+    /// `main`, `fast`, `slow`: 1 to 8 visible ASCII characters.
     pub name: String,
     /// Size; `None`: unlimited.
     pub bytes: Option<u64>,
@@ -106,9 +107,6 @@ impl Target {
             let message = format!("found {}, expected a power of two from 4 to 4096", file.alignment);
             return Err(Error::new(ErrorCode::Malformed, "alignment", message));
         }
-        if file.regions.is_empty() {
-            return Err(Error::new(ErrorCode::Malformed, "regions", "found none, expected at least one"));
-        }
         let kernels = file.kernels.unwrap_or_else(|| vec!["direct".into()]);
         if kernels.is_empty() {
             return Err(Error::new(ErrorCode::Malformed, "kernels", "found none, expected at least one"));
@@ -117,13 +115,24 @@ impl Target {
             let bytes = r.bytes.map(|b| b.bytes(&format!("region {}", r.name))).transpose()?;
             Ok(Region { name: r.name, bytes })
         };
+        let regions: Vec<Region> = file.regions.into_iter().map(region).collect::<Result<_>>()?;
+        check_regions(&regions).map_err(|message| Error::new(ErrorCode::Malformed, "regions", message))?;
         Ok(Self {
             name: file.name,
-            regions: file.regions.into_iter().map(region).collect::<Result<_>>()?,
+            regions,
             flash_bytes: file.flash.map(|f| f.bytes("flash")).transpose()?,
             alignment: file.alignment,
             kernels: kernels.iter().map(|k| kernel(k)).collect::<Result<_>>()?,
         })
+    }
+
+    /// The target with other memories (`--region`), the fastest first.
+    ///
+    /// # Errors
+    /// None or more than four, a name that an image cannot hold, or one that occurs twice.
+    pub fn with_regions(self, regions: Vec<Region>) -> Result<Self> {
+        check_regions(&regions).map_err(|message| Error::new(ErrorCode::Usage, "--region", message))?;
+        Ok(Self { regions, ..self })
     }
 
     /// The target with other limits where given (`--ram`, `--flash`); RAM is the first region's.
@@ -143,18 +152,21 @@ impl Target {
         suited.or(self.kernels.first()).copied()
     }
 
-    /// RAM for the arena; `None`: unlimited.
-    pub fn ram_bytes(&self) -> Option<u64> {
-        self.regions.first().and_then(|r| r.bytes)
-    }
-
     /// Whether plan and image fit.
     ///
     /// # Errors
-    /// `TooBig`: what is too big by how much; for the arena also the step at the peak and what is live there.
+    /// `TooBig`: what is too big by how much; for the arena also the step at the peak and what is live there, for one
+    /// in several regions also what the others hold and what all need together.
     pub fn fits(&self, model: &QModel, plan: &MemoryPlan, image_bytes: u64) -> Result<()> {
-        if let Some(limit) = self.ram_bytes().filter(|&limit| plan.arena_bytes > limit) {
-            return Err(self.too_big("arena", plan.arena_bytes, limit, &live_list(model, plan)).with_help(help(plan)));
+        let parts = (0_u8..).zip(&plan.regions).zip(&self.regions);
+        let mut limits = parts.filter_map(|((number, part), region)| Some((number, part, region.bytes?)));
+        if let Some((region, part, limit)) = limits.find(|(_, part, limit)| part.bytes > *limit) {
+            let (what, others, help) = match plan.regions.as_slice() {
+                [_] => ("arena".to_owned(), String::new(), help(part)),
+                parts => (format!("arena in region {}", part.name), others(parts, region), help_of_many(model, plan)),
+            };
+            let details = others + &live_list(model, plan, region);
+            return Err(self.too_big(&what, part.bytes, limit, &details).with_help(help));
         }
         if let Some(limit) = self.flash_bytes.filter(|&limit| image_bytes > limit) {
             let help = "use a target with more flash (--flash), or a smaller network";
@@ -197,31 +209,73 @@ fn kernel(name: &str) -> Result<KernelId> {
     })
 }
 
-fn help(plan: &MemoryPlan) -> String {
-    let proof = match plan.status {
+/// What an image can hold: one to four regions, names of visible ASCII, none twice.
+fn check_regions(regions: &[Region]) -> std::result::Result<(), String> {
+    if regions.is_empty() {
+        return Err("found none, expected at least one".into());
+    }
+    if regions.len() > layout::REGION_SLOTS {
+        return Err(format!("found {}, expected at most {}", regions.len(), layout::REGION_SLOTS));
+    }
+    for (number, Region { name, .. }) in regions.iter().enumerate() {
+        if RegionName::new(name).is_none() {
+            return Err(format!("found the name {name:?}, expected 1 to 8 visible ASCII characters"));
+        }
+        if regions[..number].iter().any(|other| other.name == *name) {
+            return Err(format!("found the name {name:?} twice, expected each once"));
+        }
+    }
+    Ok(())
+}
+
+fn help(part: &ArenaPart) -> String {
+    let proof = match part.status {
         PlanStatus::Optimal => "no plan for this order is smaller".to_string(),
-        PlanStatus::OptimalBoundNotReachable => format!("no plan is smaller; the bound is {}", plan.bound_bytes),
-        PlanStatus::NodeLimit => format!("the search was cut short; the bound is {}", plan.bound_bytes),
+        PlanStatus::OptimalBoundNotReachable => format!("no plan is smaller; the bound is {}", part.bound_bytes),
+        PlanStatus::NodeLimit => format!("the search was cut short; the bound is {}", part.bound_bytes),
     };
     format!("use a target with more RAM (--ram), or a smaller network; {proof}")
 }
 
-/// The peak step and its live buffers, largest first, in columns.
-fn live_list(model: &QModel, plan: &MemoryPlan) -> String {
-    let peak = plan.peak_step;
+/// What all regions have, against what is live at once.
+fn help_of_many(model: &QModel, plan: &MemoryPlan) -> String {
+    let all = |position: u32| (0_u8..).zip(&plan.regions).map(|(r, _)| plan.live_bytes(r, position)).sum::<u64>();
+    let fullest = (0..plan.order.len() as u32).max_by_key(|&p| (all(p), std::cmp::Reverse(p))).unwrap_or(0);
+    let room: u64 = plan.regions.iter().filter_map(|part| part.capacity).sum();
+    let step = plan.order.get(fullest as usize).map_or("", |&step| &model.steps[step as usize].name);
+    format!(
+        "give the regions more bytes (--region), or use a smaller network; at step {fullest} ({step}) {} bytes are live \
+         at once, all regions together have {room}",
+        all(fullest)
+    )
+}
+
+/// A line for each other region.
+fn others(parts: &[ArenaPart], region: u8) -> String {
+    let line = |(_, part): (u8, &ArenaPart)| match part.capacity {
+        Some(capacity) => format!("\nregion {} holds {} of {capacity} bytes", part.name, part.bytes),
+        None => format!("\nregion {} holds {} bytes", part.name, part.bytes),
+    };
+    (0_u8..).zip(parts).filter(|(number, _)| *number != region).map(line).collect()
+}
+
+/// The peak step of a region and its live buffers there, largest first, in columns.
+fn live_list(model: &QModel, plan: &MemoryPlan, region: u8) -> String {
+    let Some(peak) = plan.regions.get(usize::from(region)).map(|part| part.peak_step) else { return String::new() };
     let Some(&step) = plan.order.get(peak as usize) else { return String::new() };
     let mut live: Vec<(String, u64)> = model
         .tensors
         .iter()
         .zip(&plan.tensors)
-        .filter(|(_, p)| (p.first_step..=p.last_step).contains(&peak))
+        .filter(|(_, p)| p.region == region && (p.first_step..=p.last_step).contains(&peak))
         .map(|(t, p)| {
             let shared = p.in_place_of.filter(|_| p.first_step == peak);
             let note = shared.map(|o| format!(" (over {})", model.tensor(o).name)).unwrap_or_default();
             (format!("{}{note}", t.name), p.bytes)
         })
         .collect();
-    live.extend(plan.scratch[peak as usize].iter().map(|p| ("scratch".to_string(), p.bytes)));
+    let scratch = plan.scratch[peak as usize].iter().filter(|p| p.region == region);
+    live.extend(scratch.map(|p| ("scratch".to_string(), p.bytes)));
     live.sort_by(|a, b| b.1.cmp(&a.1).then_with(|| a.0.cmp(&b.0)));
     let mut text = format!("\nat the peak, step {} ({}), these are live:", peak, model.steps[step as usize].name);
     let width = live.iter().take(MAX_LISTED).map(|(name, _)| name.len()).max().unwrap_or(0);
@@ -287,9 +341,11 @@ mod tests {
     fn built_in_targets_are_unlimited_until_limits_are_set() {
         for (name, alignment, _) in BUILT_IN {
             let target = Target::find(name).unwrap();
-            assert_eq!((target.alignment, target.ram_bytes(), target.flash_bytes), (alignment, None, None), "{name}");
+            let main = |bytes| vec![Region { name: "main".into(), bytes }];
+            assert_eq!((target.alignment, target.flash_bytes), (alignment, None), "{name}");
+            assert_eq!(target.regions, main(None));
             let small = target.with_limits(Some(1), Some(2));
-            assert_eq!((small.ram_bytes(), small.flash_bytes), (Some(1), Some(2)));
+            assert_eq!((small.regions, small.flash_bytes), (main(Some(1)), Some(2)));
         }
         let error = Target::find("cortex-m5").unwrap_err();
         assert!(error.message.contains("'cortex-m5'") && error.help.contains("cortex-m55"), "{error}");
@@ -305,6 +361,27 @@ mod tests {
         let kernels = vec![KernelId::Direct];
         let expected = Target { name: "b".into(), regions, flash_bytes: Some(2 << 20), alignment: 16, kernels };
         assert_eq!(target, expected);
+    }
+
+    #[test]
+    fn several_regions_keep_their_order() {
+        let text = format!("{BOARD}[[regions]]\nname = 'slow'\n");
+        let target = Target::parse(&text).unwrap();
+        let region = |name: &str, bytes| Region { name: name.into(), bytes };
+        assert_eq!(target.regions, [region("main", Some(1000)), region("slow", None)]);
+        let regions = vec![region("fast", Some(64)), region("main", Some(128))];
+        assert_eq!(target.clone().with_regions(regions.clone()).unwrap().regions, regions);
+        let names = |names: &[&str]| names.iter().map(|name| region(name, Some(1))).collect::<Vec<_>>();
+        for (bad, reason) in [
+            (names(&[]), "found none"),
+            (names(&["a", "b", "c", "d", "e"]), "found 5, expected at most 4"),
+            (names(&["a", "b", "a"]), "\"a\" twice"),
+            (names(&["nine_long"]), "\"nine_long\", expected 1 to 8"),
+            (names(&[""]), "1 to 8 visible"),
+        ] {
+            let error = target.clone().with_regions(bad).unwrap_err();
+            assert!(error.location == "--region" && error.message.contains(reason), "{reason} not in: {error}");
+        }
     }
 
     #[test]
@@ -330,6 +407,8 @@ mod tests {
             (BOARD.replace("flash = '2M'", "kernels = ['amx']"), "amx"),
             (BOARD.replace("flash = '2M'", "kernels = []"), "kernels"),
             (BOARD.lines().take(3).collect::<Vec<_>>().join("\n"), "regions"),
+            (format!("{BOARD}[[regions]]\nname = 'main'\n"), "\"main\" twice"),
+            (BOARD.replace("'main'", "'main memory'"), "\"main memory\""),
             (BOARD.lines().skip(1).collect::<Vec<_>>().join("\n"), "name"),
         ];
         for (text, reason) in cases {

@@ -5,7 +5,9 @@ mod sample_image;
 
 use firmware::engine::{Engine, EngineError, Progress};
 use firmware::image::audit::{Array, AuditError, audit};
-use firmware::image::{Check, CheckProgress, Checker, Image, SectionKind, TensorRecord, crc32, layout};
+use firmware::image::{
+    Check, CheckProgress, Checker, Image, Region, RegionName, SectionKind, TensorRecord, crc32, layout,
+};
 use firmware::kernels::{Kernels, Portable, k4n16, plan};
 use firmware::program::{Clamp, ConstRange, KernelId, Requant, Requantize, Step};
 use firmware::tensor::{ElementType, Shape, TensorId};
@@ -225,8 +227,8 @@ fn packed_parts() -> ImageParts {
     linear.kernel = KernelId::K4N16;
     linear.weights = ConstRange { offset: parts.constants.len() as u32, bytes: packed.len() as u32 };
     let record = &mut parts.tensors[usize::from(linear.scratch.expect("scratch").0)];
-    (record.offset, record.bytes) = (parts.arena_bytes, scratch);
-    parts.arena_bytes += scratch;
+    (record.offset, record.bytes) = (parts.regions[0].bytes, scratch);
+    parts.regions[0].bytes += scratch;
     parts.constants.extend(packed.iter().map(|weight| weight.cast_unsigned()));
     parts
 }
@@ -274,10 +276,10 @@ fn engine_refuses_a_bad_arena_and_missing_kernels() {
     let needed = image.arena_bytes();
     let mut small = AlignedBytes::zeroed(needed as usize - 1);
     let error = Engine::new(image, Portable, &mut small).expect_err("too small");
-    assert_eq!(error, EngineError::ArenaTooSmall { found: needed - 1, needed });
+    assert_eq!(error, EngineError::ArenaTooSmall { region: RegionName::MAIN, found: needed - 1, needed });
     let mut arena = AlignedBytes::zeroed(needed as usize + 16);
     let error = Engine::new(image, Portable, &mut arena[8..]).expect_err("misaligned");
-    assert_eq!(error, EngineError::ArenaMisaligned { remainder: 8, alignment: 16 });
+    assert_eq!(error, EngineError::ArenaMisaligned { region: RegionName::MAIN, remainder: 8, alignment: 16 });
     let error = Engine::new(image, NoKernels, &mut arena).expect_err("no kernels");
     assert_eq!(error, EngineError::KernelMissing(KernelId::Direct));
 }
@@ -384,7 +386,7 @@ fn bytes_of_dead_tensors_do_not_matter() {
         for position in 0..STEPS as u16 {
             let kept: Vec<_> =
                 records.iter().filter(|r| r.first_step < position.max(1) && r.is_live(position)).collect();
-            for (at, byte) in engine.arena_mut().iter_mut().enumerate() {
+            for (at, byte) in engine.regions_mut().flatten().enumerate() {
                 if !kept.iter().any(|r| (u64::from(r.offset)..r.end()).contains(&(at as u64))) {
                     *byte = poison;
                 }
@@ -483,9 +485,9 @@ fn parts_that_do_not_fit_are_refused_by_name() {
     parts.target = "t".repeat(17);
     assert!(assemble(&parts).expect_err("target").message.contains("16 bytes"));
     parts = sample_image::parts();
-    parts.arena_bytes -= 16;
+    parts.regions[0].bytes -= 16;
     let error = emit(&parts).expect_err("arena");
-    assert!(error.message.contains("outside the arena"), "{error}");
+    assert!(error.message.contains("outside its memory region"), "{error}");
 }
 
 #[test]
@@ -501,6 +503,7 @@ fn page_example() -> ImageParts {
     let tensor = |offset, first_step| TensorRecord {
         element: ElementType::I8,
         shape: Shape::vector(16),
+        region: 0,
         offset,
         bytes: 16,
         first_step,
@@ -522,8 +525,7 @@ fn page_example() -> ImageParts {
         constants: vec![],
         inputs: vec![port("x", 0)],
         outputs: vec![port("y", 1)],
-        arena_bytes: 32,
-        arena_alignment: 16,
+        regions: vec![Region { name: RegionName::MAIN, bytes: 32, alignment: 16 }],
         target: String::new(),
         revision: 0,
         qmodel_digest: [0; 32],
@@ -542,6 +544,7 @@ fn format_page_shows_a_real_image() {
     let dump: String = lines.collect();
     let page = include_str!("../../firmware/src/image/example.hex");
     assert_eq!(dump, page, "the dump of firmware/src/image/example.hex should be:\n{dump}");
+    assert_eq!(bytes, include_bytes!("../../firmware/src/image/example.bin"));
 }
 
 #[test]

@@ -4,8 +4,8 @@
 mod sample_image;
 
 use firmware::fault::disable_check;
-use firmware::image::layout::{header, section, tensor};
-use firmware::image::{Check, Image, ParseError, SectionKind, TensorRecord, layout};
+use firmware::image::layout::{header, region, section, tensor};
+use firmware::image::{Check, Image, ParseError, Region, RegionName, SectionKind, TensorRecord, layout};
 use firmware::kernels::plan;
 use firmware::program::*;
 use firmware::tensor::{ElementType, Shape, TensorId};
@@ -38,9 +38,14 @@ fn record(parts: &mut ImageParts, id: u16) -> &mut TensorRecord {
 /// Moves tensors to memory of their own, all to the same place.
 fn to_fresh_memory(parts: &mut ImageParts, tensors: &[u16]) {
     for id in tensors {
-        record(parts, *id).offset = parts.arena_bytes;
+        record(parts, *id).offset = parts.regions[0].bytes;
     }
-    parts.arena_bytes += 8192;
+    parts.regions[0].bytes += 8192;
+}
+
+/// A second region.
+fn fast() -> Region {
+    Region { name: RegionName::new("fast").expect("a name"), bytes: 64, alignment: 16 }
 }
 
 fn slot(kind: SectionKind) -> usize {
@@ -98,11 +103,18 @@ fn header_changes() -> Vec<(Check, Change)> {
         (Check::InputCount, Sealed(|b| b[header::INPUT_COUNT].fill(17))),
         (Check::OutputCount, Sealed(|b| b[header::OUTPUT_COUNT].fill(0))),
         (Check::OutputCount, Sealed(|b| b[header::OUTPUT_COUNT].fill(17))),
-        (Check::RegionCount, Sealed(|b| b[header::REGION_COUNT].fill(2))),
-        (Check::RegionName, Sealed(|b| b[header::REGIONS.start] = b'f')),
-        (Check::RegionAlignment, Parts(|p| p.arena_alignment = 8)),
-        (Check::RegionAlignment, Parts(|p| p.arena_alignment = 48)),
-        (Check::RegionAlignment, Parts(|p| p.arena_alignment = 8192)),
+        (Check::RegionCount, Sealed(|b| b[header::REGION_COUNT].fill(0))),
+        (Check::RegionCount, Sealed(|b| b[header::REGION_COUNT].fill(5))),
+        (Check::RegionName, Sealed(|b| b[header::REGION_COUNT].fill(2))),
+        (Check::RegionName, Sealed(|b| b[header::REGIONS.start] = 0)),
+        (Check::RegionName, Sealed(|b| b[header::REGIONS.start + 1] = b' ')),
+        (Check::RegionName, Sealed(|b| b[header::REGIONS.start + region::NAME.end - 1] = b'x')),
+        (Check::RegionRepeated, Parts(|p| p.regions.push(p.regions[0]))),
+        (Check::RegionBytes, Parts(|p| p.regions.push(Region { bytes: u32::MAX, ..fast() }))),
+        (Check::RegionAlignment, Parts(|p| p.regions.push(Region { alignment: 0, ..fast() }))),
+        (Check::RegionAlignment, Parts(|p| p.regions[0].alignment = 8)),
+        (Check::RegionAlignment, Parts(|p| p.regions[0].alignment = 48)),
+        (Check::RegionAlignment, Parts(|p| p.regions[0].alignment = 8192)),
         (Check::ModelName, Sealed(|b| b[header::NAME.start] = 0xFF)),
         (Check::ModelName, Sealed(|b| b[header::NAME.end - 1] = b'x')),
         (Check::TargetName, Sealed(|b| b[header::TARGET.start] = 0xFF)),
@@ -190,6 +202,20 @@ fn table_changes() -> Vec<(Check, Change)> {
         (Check::TensorReserved, Sealed(|b| first_record(b, tensor::RESERVED.start, 1))),
         (Check::TensorReserved, Sealed(|b| first_record(b, tensor::RESERVED.end - 1, 1))),
         (Check::TensorRegion, Sealed(|b| first_record(b, tensor::REGION.start, 1))),
+        (
+            Check::TensorRegion,
+            Parts(|p| {
+                p.regions.push(fast());
+                record(p, ids::KEY).region = 2;
+            }),
+        ),
+        (
+            Check::TensorInside,
+            Parts(|p| {
+                p.regions.push(Region { bytes: 16, ..fast() });
+                record(p, ids::KEY).region = 1;
+            }),
+        ),
         (Check::TensorBatch, Sealed(|b| first_record(b, tensor::BATCH.start, 2))),
         (
             Check::TensorShape,
@@ -203,7 +229,7 @@ fn table_changes() -> Vec<(Check, Change)> {
         (Check::TensorBytes, Parts(|p| record(p, ids::STREAM).bytes += 16)),
         (Check::TensorBytes, Parts(|p| scratch_record(p).bytes = 0)),
         (Check::TensorAlignment, Parts(|p| record(p, ids::RGB).offset += 2)),
-        (Check::TensorInside, Parts(|p| record(p, ids::KEY).offset = p.arena_bytes)),
+        (Check::TensorInside, Parts(|p| record(p, ids::KEY).offset = p.regions[0].bytes)),
         (Check::TensorInside, Parts(|p| record(p, ids::KEY).offset = 0xFFFF_FFF0)),
         (Check::TensorLive, Parts(|p| record(p, ids::KEY).last_step = STEPS as u16)),
         (Check::TensorLive, Parts(|p| record(p, ids::KEY).last_step = 6)),
@@ -290,6 +316,21 @@ fn memory_changes() -> Vec<(Check, Change)> {
         ),
         (Check::InPlaceOnce, Parts(|p| step!(p, at::ADD, Add, |s| s.first.tensor = TensorId(ids::LIDAR_NARROW)))),
         (Check::InPlacePosition, Parts(|p| to_fresh_memory(p, &[ids::CONTEXT]))),
+        (
+            Check::InPlacePosition,
+            Parts(|p| {
+                p.regions.push(Region { bytes: p.regions[0].bytes, ..fast() });
+                record(p, ids::CONTEXT).region = 1;
+            }),
+        ),
+        (
+            Check::StepOverlap,
+            Parts(|p| {
+                p.regions.push(Region { bytes: p.regions[0].bytes, ..fast() });
+                (record(p, ids::NORMED).region, record(p, ids::STREAM).region) = (1, 1);
+                record(p, ids::NORMED).offset = record(p, ids::STREAM).offset;
+            }),
+        ),
         (
             Check::InPlaceLastUse,
             Parts(|p| {
@@ -535,7 +576,7 @@ fn softmax_alone(channels: u16) -> ImageParts {
     let tensor = |offset| TensorRecord { element, shape, offset, bytes, ..parts.tensors[0] };
     let behind = bytes.next_multiple_of(16);
     parts.tensors = vec![tensor(0), tensor(behind)];
-    parts.arena_bytes = 2 * behind;
+    parts.regions[0].bytes = 2 * behind;
     parts.inputs = vec![port("x", 0)];
     parts.outputs = vec![port("y", 1)];
     step!(parts, 0, Attention, |s| {
@@ -557,7 +598,7 @@ fn spatial_softmax_alone(shape: Shape) -> ImageParts {
     parts.tensors[0] = TensorRecord { shape, bytes: input, ..parts.tensors[0] };
     let (element, offset) = (ElementType::I32, input.next_multiple_of(16));
     parts.tensors[1] = TensorRecord { element, shape: points, offset, bytes: output, ..parts.tensors[1] };
-    parts.arena_bytes = offset + output.next_multiple_of(16);
+    parts.regions[0].bytes = offset + output.next_multiple_of(16);
     step!(parts, 0, Softmax, |s| {
         let (exponent, exp_table) = (s.exponent, s.exp_table);
         parts.steps =
@@ -574,6 +615,7 @@ fn attention_alone(tokens: u16, channels: u16, heads: u16) -> ImageParts {
     let tensor = |offset| TensorRecord {
         element: ElementType::I8,
         shape: Shape::tokens(tokens, channels),
+        region: 0,
         offset,
         bytes,
         first_step: 0,
@@ -582,7 +624,7 @@ fn attention_alone(tokens: u16, channels: u16, heads: u16) -> ImageParts {
     };
     let scratch = plan::attention_scratch_bytes(tokens.into(), channels, heads);
     parts.tensors = (0..4).map(|i| tensor(i * stride)).chain([TensorRecord::scratch(4 * stride, scratch, 0)]).collect();
-    parts.arena_bytes = 4 * stride + scratch.next_multiple_of(16);
+    parts.regions[0].bytes = 4 * stride + scratch.next_multiple_of(16);
     parts.inputs = vec![port("q", 0), port("k", 1), port("v", 2)];
     parts.outputs = vec![port("y", 3)];
     step!(parts, at::ATTENTION, Attention, |s| {
@@ -604,7 +646,7 @@ fn endless_convolution() -> ImageParts {
     let map = 1 << 30;
     let tensor = |offset| TensorRecord { shape, offset, bytes: shape.elements() as u32, ..parts.tensors[0] };
     parts.tensors = vec![tensor(0), tensor(map), TensorRecord::scratch(2 * map, scratch, 0)];
-    parts.arena_bytes = 2 * map + scratch.next_multiple_of(16);
+    parts.regions[0].bytes = 2 * map + scratch.next_multiple_of(16);
     parts.inputs = vec![port("x", 0)];
     parts.outputs = vec![port("y", 1)];
     parts.constants = vec![0; 255 * 255 + 15];

@@ -63,6 +63,8 @@ pub enum Program {
     Drive,
     /// Checks for bench and test.
     Check,
+    /// The one in C (`firmware/boards/c`), of the first board alone.
+    InC,
 }
 
 /// What a run gave.
@@ -83,23 +85,21 @@ impl Board {
         self.check("self-test", image)
     }
 
-    /// Runs a check over an image and what lies behind it; `None` where the program or the emulator is missing, which is said past the test's
-    /// capture.
+    /// Runs a check over an image and what lies behind it; `None` where the program or the emulator is missing, which
+    /// is said past the test's capture.
     ///
     /// # Panics
     /// The image cannot be written or the emulator not started.
     pub fn check(&self, check: &str, memory: &[u8]) -> Option<Run> {
-        let program = self.program(Program::Check);
-        if !program.exists() || !is_installed(self.emulator) {
-            let _ = writeln!(
-                std::io::stderr(),
-                "not run: board {}; tests/run builds {} and installs {} (Debian's package qemu-system-arm)",
-                self.name,
-                program.display(),
-                self.emulator
-            );
-            return None;
-        }
+        self.run_program(Program::Check, check, memory)
+    }
+
+    /// Runs a program with a command line; as [`Self::check`].
+    ///
+    /// # Panics
+    /// As [`Self::check`].
+    pub fn run_program(&self, program: Program, command_line: &str, memory: &[u8]) -> Option<Run> {
+        let program = self.built_program(program)?;
         let folder = tempfile::tempdir().expect("a temporary folder");
         let file = folder.path().join("model.img");
         fs::write(&file, memory).expect("the image");
@@ -109,11 +109,27 @@ impl Board {
             .args(["-display", "none", "-monitor", "none", "-serial", "stdio", "-icount", "shift=6"])
             .args(["-semihosting-config", "enable=on,target=native", "-device"])
             .arg(format!("loader,file={},addr={:#x},force-raw=on", file.display(), self.image_address))
-            .args(["-append", check, "-kernel"])
+            .args(["-append", command_line, "-kernel"])
             .arg(program)
             .output()
             .unwrap_or_else(|e| panic!("{}: {e}", self.emulator));
         Some(Run { status: output.status.code(), console: String::from_utf8_lossy(&output.stdout).into_owned() })
+    }
+
+    /// A program of the board; `None` where it or the emulator is missing, which is said past the test's capture.
+    pub fn built_program(&self, program: Program) -> Option<PathBuf> {
+        let program = self.program(program);
+        if program.exists() && is_installed(self.emulator) {
+            return Some(program);
+        }
+        let _ = writeln!(
+            std::io::stderr(),
+            "not run: board {}; tests/run builds {} and installs {} (Debian's package qemu-system-arm)",
+            self.name,
+            program.display(),
+            self.emulator
+        );
+        None
     }
 
     /// Where `tests/run` puts the ELF of a program.
@@ -122,6 +138,7 @@ impl Board {
         let name = match program {
             Program::Drive => format!("{}-drive", self.name),
             Program::Check => format!("{}-check", self.name),
+            Program::InC => format!("{}-c", self.name),
         };
         root.join("target/mcu").join(self.triple).join("release").join(name)
     }

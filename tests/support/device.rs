@@ -2,7 +2,7 @@
 
 use crate::nor_flash::NorFlash;
 use crate::random::Random;
-use firmware::image::{CheckProgress, Image, TensorRecord, crc32, layout};
+use firmware::image::{CheckProgress, Image, Region, RegionName, TensorRecord, crc32, layout};
 use firmware::kernels::{Kernels, Portable};
 use firmware::program::{Clamp, Requant, Requantize, Step};
 use firmware::tensor::{ElementType, Shape, TensorId};
@@ -22,6 +22,7 @@ pub fn parts(revision: u32, bytes: usize) -> ImageParts {
     let tensor = |offset| TensorRecord {
         element: ElementType::I8,
         shape: Shape::vector(16),
+        region: 0,
         offset,
         bytes: 16,
         first_step: 0,
@@ -44,8 +45,7 @@ pub fn parts(revision: u32, bytes: usize) -> ImageParts {
         constants: (0..bytes).map(|_| random.bits() as u8).collect(),
         inputs: vec![port("x", 0)],
         outputs: vec![port("y", 1)],
-        arena_bytes: 32,
-        arena_alignment: 16,
+        regions: vec![Region { name: RegionName::MAIN, bytes: 32, alignment: 16 }],
         target: TARGET.into(),
         revision,
         qmodel_digest: [0; 32],
@@ -152,23 +152,19 @@ impl<const WRITE: usize, const ERASE: usize> Device<WRITE, ERASE> {
         self.updater(running).confirm()
     }
 
-    /// What is wrong with the flash, judged from its bytes alone: a record that tells of an image that is not there
-    /// whole, or part of an image that would pass for the factory's. `known` are all images that were ever sent.
+    /// What is wrong with the flash, judged from its bytes alone: a slot that looks as if its image could run, although
+    /// it is not there whole. `known` are all images that were ever sent. A slot without an image's first bytes cannot
+    /// look so, nor can one with a claim and no record, or with a record whose trials are used up.
     pub fn lie(&self, known: &[&[u8]]) -> Option<String> {
         [Slot::A, Slot::B].into_iter().find_map(|slot| {
-            let start = self.slots.image_offset(slot) as usize;
-            let stored = &self.flash.bytes()[start..];
-            let whole = known.iter().any(|image| stored.starts_with(image));
-            match self.record(slot) {
-                Some((_, bytes)) => {
-                    let told = known.iter().any(|image| image.len() == bytes as usize && stored.starts_with(image));
-                    (!told).then(|| format!("{slot}: the record tells of {bytes} bytes that are no image"))
-                }
-                None if !self.is_claimed(slot) && !whole && stored.starts_with(&layout::MAGIC) => {
-                    Some(format!("{slot}: part of an image without a claim"))
-                }
-                None => None,
-            }
+            let stored = &self.flash.bytes()[self.slots.image_offset(slot) as usize..];
+            let record = self.record(slot);
+            let looks_so = if record.is_some() { self.may_run(slot) } else { !self.is_claimed(slot) };
+            let is_whole = known.iter().any(|image| {
+                stored.starts_with(image) && record.is_none_or(|(_, bytes)| bytes as usize == image.len())
+            });
+            let lies = looks_so && stored.starts_with(&layout::MAGIC) && !is_whole;
+            lies.then(|| format!("{slot}: part of an image, and the record {record:?}"))
         })
     }
 
@@ -205,7 +201,17 @@ impl<const WRITE: usize, const ERASE: usize> Device<WRITE, ERASE> {
 
     /// Trials of a slot's image that are used up.
     pub fn trials(&self, slot: Slot) -> usize {
-        let unit = |n: usize| &self.flash.bytes()[self.record_start(slot) + n * Self::unit()..][..16];
-        (0..usize::from(TRIALS)).filter(|trial| unit(2 + 2 * trial) != [0xFF; 16]).count()
+        self.marks(slot).filter(|[tried, _]| *tried != [0xFF; 16]).count()
+    }
+
+    /// Whether the image of a slot with a record is confirmed or has a trial left.
+    fn may_run(&self, slot: Slot) -> bool {
+        self.trials(slot) < usize::from(TRIALS) || self.marks(slot).any(|[_, confirmed]| *confirmed == CONFIRMED)
+    }
+
+    /// The units `tried` and `confirmed` of each trial.
+    fn marks(&self, slot: Slot) -> impl Iterator<Item = [&[u8]; 2]> {
+        let unit = move |n: usize| &self.flash.bytes()[self.record_start(slot) + n * Self::unit()..][..16];
+        (0..usize::from(TRIALS)).map(move |trial| [unit(2 + 2 * trial), unit(3 + 2 * trial)])
     }
 }

@@ -3,9 +3,9 @@
 
 use crate::build;
 use crate::random::Random;
-use firmware::image::Image;
+use firmware::image::{Image, Region, RegionName};
 use firmware::program::Window;
-use firmware::tensor::Shape;
+use firmware::tensor::{ElementType, Shape};
 use model_compiler::emit::{AlignedBytes, ImageParts, KnownAnswer};
 use model_compiler::frames::{ByteMap, Frame};
 use model_compiler::ir::{
@@ -148,6 +148,23 @@ pub fn parts_for(target: &str) -> ImageParts {
     let compiled = compiled_for(target);
     let mut parts = pack(&compiled.record.model, &compiled.record.plan).unwrap_or_else(|e| panic!("{e}"));
     parts.known_answer = Image::parse(&AlignedBytes::from(compiled.image.as_slice())).ok().and_then(stored_answer);
+    parts
+}
+
+/// The same parts in two memory regions: scratch and every third chain of tensors lie in a second one.
+///
+/// # Panics
+/// Never: the name is a name.
+pub fn in_two_regions(mut parts: ImageParts) -> ImageParts {
+    for id in 0..parts.tensors.len() {
+        let mut root = id;
+        while let Some(operand) = parts.tensors[root].in_place_of {
+            root = operand.0.into();
+        }
+        let second = parts.tensors[id].element == ElementType::Scratch || root.is_multiple_of(3);
+        parts.tensors[id].region = u8::from(second);
+    }
+    parts.regions.push(Region { name: RegionName::new("slow").expect("a name"), ..parts.regions[0] });
     parts
 }
 
@@ -314,7 +331,7 @@ mod tests {
     use firmware::engine::Engine;
     use firmware::kernels::Portable;
     use firmware::program::{Requant, Residual, ResizeBilinear, Step};
-    use firmware::tensor::{ElementType, TensorId};
+    use firmware::tensor::TensorId;
     use model_compiler::emit::emit;
 
     #[test]

@@ -4,6 +4,7 @@ pub mod agent;
 pub mod boards;
 pub mod build;
 pub mod bundle;
+pub mod c_header;
 pub mod commands;
 pub mod device;
 pub mod drive_log;

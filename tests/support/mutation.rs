@@ -185,8 +185,8 @@ fn visit_tensors(parts: &ImageParts, visit: Visit<'_>) {
             change(record);
             let bytes = record.shape.elements() * u64::from(record.element.bytes());
             record.bytes = if record.element == ElementType::Scratch { 64 } else { bytes as u32 };
-            record.offset = parts.arena_bytes.next_multiple_of(16);
-            parts.arena_bytes = record.offset.saturating_add(record.bytes).saturating_add(64);
+            record.offset = parts.regions[0].bytes.next_multiple_of(16);
+            parts.regions[0].bytes = record.offset.saturating_add(record.bytes).saturating_add(64);
             visit_parts(&format!("tensor {number} moved, {what}"), &parts, visit);
         };
         for element in [ElementType::I8, ElementType::I16, ElementType::I32, ElementType::Scratch] {

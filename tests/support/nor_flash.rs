@@ -125,15 +125,16 @@ impl<const WRITE: usize, const ERASE: usize> NorFlash<WRITE, ERASE> {
             Operation::Erase(range) => {
                 let range = range.start as usize..range.end as usize;
                 // The manufacturers promise nothing; these are what is seen, the first from a cut that came early.
-                let way = self.random.below(5);
+                let way = self.random.below(6);
                 let erased = self.random.below(range.len() + 1);
                 for (position, byte) in self.bytes[range.clone()].iter_mut().enumerate() {
                     *byte = match way {
                         0 => *byte,
                         1 => *byte | self.random.bits() as u8,
                         2 if position < erased => 0xFF,
-                        2 => *byte,
-                        3 => self.random.bits() as u8,
+                        3 if position >= erased => 0xFF,
+                        2 | 3 => *byte,
+                        4 => self.random.bits() as u8,
                         _ => 0xFF,
                     };
                 }

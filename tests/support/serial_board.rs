@@ -54,10 +54,7 @@ impl SerialBoard {
         let kept = File::options().read(true).write(true).open(&device).expect("the terminal's other end");
         let thread = thread::spawn(move || {
             let image = AlignedBytes::from(image.as_slice());
-            let mut arena = match Image::parse(&image) {
-                Ok(image) => GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize),
-                Err(_) => GuardedArena::new(0, 16),
-            };
+            let mut arena = Image::parse(&image).ok().map(|image| GuardedArena::new(&image));
             let mut board = Board {
                 master,
                 requests: Wire::new(requests),
@@ -69,7 +66,7 @@ impl SerialBoard {
             let computer = Computer {
                 image: &image,
                 kernels: Portable,
-                arena: arena.poisoned(0),
+                arena: arena.as_mut().map_or_else(|| (&mut [][..]).into(), |arena| arena.poisoned(0)),
                 memory: &mut Memory::new(),
                 line: &mut Line::new(),
                 board: &mut board,

@@ -1,7 +1,7 @@
 //! Small programs drawn by hand, and images made from them that one single check of the parser refuses.
 
 use firmware::image::layout::{header, region, tensor};
-use firmware::image::{Check, SectionKind, TensorRecord, layout};
+use firmware::image::{Check, Region, RegionName, SectionKind, TensorRecord, layout};
 use firmware::program::{
     Add, Attention, AveragePool, BranchLinear, Clamp, ConstRange, Conv2d, CopyBox, KernelId, LayerNorm, Linear,
     MaxPool, Requant, Requantize, Rescale, Residual, ResizeBilinear, SpatialSoftmax, Step, Term, TokenSource, Tokens,
@@ -145,6 +145,7 @@ impl Sketch {
             tensors.push(TensorRecord {
                 element: *element,
                 shape: *shape,
+                region: 0,
                 offset,
                 bytes,
                 first_step: first,
@@ -161,8 +162,7 @@ impl Sketch {
             constants: vec![1; self.constants as usize],
             inputs: self.inputs.iter().map(port).collect(),
             outputs: self.outputs.iter().map(port).collect(),
-            arena_bytes: offset,
-            arena_alignment: 16,
+            regions: vec![Region { name: RegionName::MAIN, bytes: offset, alignment: 16 }],
             target: String::new(),
             revision: 0,
             qmodel_digest: [0; 32],
@@ -248,6 +248,16 @@ fn of_the_file() -> Vec<(Check, Vec<u8>)> {
         let start = u32::from_le_bytes(bytes[program].try_into().expect("four bytes")) as usize;
         bytes[start - 1] = 1; // behind the three entries of the step index
     });
+    let with_regions = |regions: &[(&str, u32)]| {
+        let mut parts = small.clone();
+        parts.regions.extend(regions.iter().map(|&(name, bytes)| Region {
+            name: RegionName::new(name).expect("a name"),
+            bytes,
+            alignment: 16,
+        }));
+        parts
+    };
+    let four = with_regions(&[("a", 16), ("b", 16), ("c", 16)]);
     let mut answered = small.clone();
     answered.known_answer = Some(model_compiler::emit::KnownAnswer { seed: 1, step_crcs: vec![0; 4] });
     vec![
@@ -258,6 +268,9 @@ fn of_the_file() -> Vec<(Check, Vec<u8>)> {
         (Check::TensorCount, sealed(&chain(2048, Sketch::linear))),
         (Check::InputCount, sealed(&many_inputs)),
         (Check::OutputCount, sealed(&many_outputs)),
+        (Check::RegionCount, edited(&four, |bytes| bytes[header::REGION_COUNT].fill(5))),
+        (Check::RegionRepeated, sealed(&with_regions(&[("main", 16)]))),
+        (Check::RegionBytes, sealed(&with_regions(&[("fast", u32::MAX)]))),
         (Check::SectionLength, sealed(&answered)),
         (Check::SectionEnd, longer),
         (Check::StepIndex, program_edited(&small, |program| program.insert(0, 0), 1)),
@@ -417,8 +430,8 @@ fn of_in_place_pairs() -> Vec<(Check, Vec<u8>)> {
     over(&mut last_use, y, x);
     let mut position = last_use.clone();
     position.tensors[usize::from(y.0)].in_place_of = None;
-    position.tensors[usize::from(y.0)].offset = position.arena_bytes - 4;
-    position.arena_bytes += 16;
+    position.tensors[usize::from(y.0)].offset = position.regions[0].bytes - 4;
+    position.regions[0].bytes += 16;
     position.tensors[usize::from(z.0)].in_place_of = Some(x);
     let mut sketch = Sketch::default();
     let map = Shape::map(4, 4, 1);

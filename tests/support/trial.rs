@@ -1,7 +1,8 @@
 //! One image, whatever it holds, through parser and engine: what happened to it.
 
+use firmware::arena::Regions;
 use firmware::engine::{Engine, EngineError};
-use firmware::image::{Check, Image, ParseError};
+use firmware::image::{Check, Image, ParseError, Region, layout};
 use firmware::kernels::{Kernels, Portable};
 use firmware::tensor::TensorId;
 use host_sim::backends::{Backend, BackendKind};
@@ -43,7 +44,6 @@ impl Verdict {
 pub struct Bench {
     backend: Backend,
     memory: AlignedBytes,
-    start: usize,
     noise: Vec<u8>,
 }
 
@@ -56,11 +56,10 @@ impl Default for Bench {
 impl Bench {
     /// Trials on a backend.
     pub fn of(backend: Backend) -> Self {
-        let mut memory = AlignedBytes::zeroed(MAX_ARENA + 3 * GUARD);
+        let mut memory = AlignedBytes::zeroed(MAX_ARENA + (2 * layout::REGION_SLOTS + 2) * GUARD);
         memory.fill(GUARD_BYTE);
-        let start = GUARD + memory.as_ptr().align_offset(GUARD);
         let noise = (0..MAX_ARENA).map(|i| (i * 167 + (i >> 8)) as u8).collect();
-        Self { backend, memory, start, noise }
+        Self { backend, memory, noise }
     }
 
     /// Parses and runs an image on inputs that use all codes.
@@ -75,31 +74,55 @@ impl Bench {
     }
 
     fn run(&mut self, image: Image<'_>) -> Verdict {
-        let size = image.arena_bytes() as usize;
-        if size > MAX_ARENA {
-            let refused = Engine::new(image, Portable, &mut self.memory[self.start..self.start + MAX_ARENA]).err();
+        if image.arena_bytes() as usize > MAX_ARENA {
+            let refused = Engine::new(image, Portable, buffers(&image, &mut self.memory[..MAX_ARENA])).err();
             assert!(matches!(refused, Some(EngineError::ArenaTooSmall { .. })), "{refused:?}");
             return Verdict::TooLarge;
         }
         if image.work() > MAX_WORK {
             return Verdict::TooLarge;
         }
-        let end = self.start + size;
         let kernels = self.backend.kernels();
-        let verdict = match infer(image, kernels, &mut self.memory[self.start..end], &self.noise) {
+        let verdict = match infer(image, kernels, buffers(&image, &mut self.memory), &self.noise) {
             Ok(()) => Verdict::Ran,
             Err(error) => Verdict::Failed(error),
         };
+        let (guard, mut rest) = first_guard(&mut self.memory);
         let intact = |bytes: &[u8]| bytes.iter().all(|byte| *byte == GUARD_BYTE);
-        assert!(intact(&self.memory[self.start - GUARD..self.start]), "wrote in front of the arena");
-        assert!(intact(&self.memory[end..end + GUARD]), "wrote behind the arena");
-        self.memory[self.start..end].fill(GUARD_BYTE);
+        assert!(intact(guard), "wrote in front of the arena");
+        for region in image.regions() {
+            let (arena, guard) = cut(&mut rest, &region);
+            arena.fill(GUARD_BYTE);
+            assert!(intact(guard), "wrote behind the arena of region {}", region.name);
+        }
         verdict
     }
 }
 
+/// A buffer per region of an image, with a guard on both sides of each; too small where memory is short.
+fn buffers<'m>(image: &Image<'_>, memory: &'m mut [u8]) -> Regions<'m> {
+    let (_, mut rest) = first_guard(memory);
+    image.regions().map(|region| cut(&mut rest, &region).0).collect()
+}
+
+/// The first guard, and the rest from a multiple of every alignment on.
+fn first_guard(memory: &mut [u8]) -> (&mut [u8], &mut [u8]) {
+    let start = GUARD + memory.as_ptr().align_offset(GUARD);
+    let (guard, rest) = memory.split_at_mut(start);
+    (&mut guard[start - GUARD..], rest)
+}
+
+/// The arena of the next region and the guard behind it, to the next multiple of every alignment.
+fn cut<'m>(rest: &mut &'m mut [u8], region: &Region) -> (&'m mut [u8], &'m mut [u8]) {
+    let size = region.bytes as usize;
+    let end = (size.next_multiple_of(GUARD) + GUARD).min(rest.len());
+    let (here, behind) = std::mem::take(rest).split_at_mut(end);
+    *rest = behind;
+    here.split_at_mut(size.min(end))
+}
+
 /// A whole inference, and every output read.
-fn infer(image: Image<'_>, kernels: &dyn Kernels, arena: &mut [u8], noise: &[u8]) -> Result<(), EngineError> {
+fn infer(image: Image<'_>, kernels: &dyn Kernels, arena: Regions<'_>, noise: &[u8]) -> Result<(), EngineError> {
     let input = |number| {
         let record = image.input(number).and_then(|port| image.tensor(port.tensor));
         record.and_then(|record| noise.get(..record.bytes as usize)).unwrap_or_default()

@@ -1,6 +1,6 @@
 //! The third level of proof: what needs the constants, or is a second opinion on `parse`.
 //!
-//! * No two buffers share a byte of the arena while both are live, judged from the tensor table alone.
+//! * No two buffers share a byte of a memory region while both are live, judged from the tensor table alone.
 //! * No accumulator can leave its type, whatever the input codes and in whatever order a backend sums: per output
 //!   channel `|b'| + 383·Σ|w|` (8-bit input; some backends shift codes by 128) or `|b'| + 32768·Σ|w|` (16-bit), plus the
 //!   half of the first rounding.

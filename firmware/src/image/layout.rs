@@ -1,6 +1,7 @@
 //! Named byte ranges of the image file: the one place that knows where a field lies. The reader ([`super::Image`]) and
 //! the compiler's writer both use these constants.
 
+use crate::tensor::index;
 use core::ops::Range;
 
 /// First eight bytes of every image. The first byte is not ASCII and the tail catches line-end conversion.
@@ -10,7 +11,7 @@ pub const FORMAT: u16 = 1;
 /// Base address, sections, constant ranges and tensors are aligned to this many bytes.
 pub const ALIGNMENT: usize = 16;
 
-/// Offsets in the arena are multiples of this: the widest element that the operators view there.
+/// Offsets in a region are multiples of this: the widest element that the operators view there.
 pub const ARENA_OFFSET_ALIGNMENT: usize = 4;
 /// Largest number of steps.
 pub const MAX_STEPS: u16 = 2048;
@@ -18,7 +19,7 @@ pub const MAX_STEPS: u16 = 2048;
 pub const MAX_TENSORS: u16 = 4096;
 /// Largest number of inputs and of outputs, each.
 pub const MAX_PORTS: u8 = 16;
-/// Largest arena alignment.
+/// Largest alignment of a region.
 pub const MAX_ARENA_ALIGNMENT: u32 = 4096;
 /// Largest work of one inference, in elementary operations (about an hour on one fast core).
 pub const MAX_WORK: u64 = 1 << 42;
@@ -44,7 +45,7 @@ pub mod header {
     pub const INPUT_COUNT: Range<usize> = 26..27;
     /// `u8`: number of outputs.
     pub const OUTPUT_COUNT: Range<usize> = 27..28;
-    /// `u8`: number of memory regions; 1 in this format.
+    /// `u8`: number of memory regions, 1..=[`super::REGION_SLOTS`].
     pub const REGION_COUNT: Range<usize> = 28..29;
     /// Zero.
     pub const RESERVED_A: Range<usize> = 29..32;
@@ -77,16 +78,16 @@ pub const REGION_SLOTS: usize = 4;
 pub mod region {
     use super::Range;
 
-    /// Name, ASCII, padded with zeros (`main`).
-    pub const NAME: Range<usize> = 0..8;
-    /// `u32`: bytes of the arena that the caller provides.
+    /// Name, visible ASCII, padded with zeros (`main`); no two regions have the same.
+    pub const NAME: Range<usize> = 0..NAME_BYTES;
+    /// `u32`: bytes of the arena that the caller provides there. Those of all regions are less than 2^32.
     pub const ARENA_BYTES: Range<usize> = 8..12;
-    /// `u32`: alignment of the arena; a power of two, 16..=4096.
+    /// `u32`: alignment of these bytes; a power of two, 16..=4096.
     pub const ALIGNMENT: Range<usize> = 12..16;
     /// Size of a slot.
     pub const BYTES: usize = 16;
-    /// Name of the ordinary region.
-    pub const MAIN: [u8; 8] = *b"main\0\0\0\0";
+    /// Size of a name.
+    pub const NAME_BYTES: usize = 8;
 }
 
 /// Section slots in the header.
@@ -131,13 +132,13 @@ pub mod port {
 pub mod tensor {
     use super::Range;
 
-    /// `u8`: region; 0.
+    /// `u8`: region, a slot of [`super::header::REGIONS`].
     pub const REGION: Range<usize> = 0..1;
     /// `u8`: [`crate::tensor::ElementType`].
     pub const ELEMENT: Range<usize> = 1..2;
     /// `u16`: tensor whose memory this one takes over, or [`NOT_IN_PLACE`].
     pub const IN_PLACE_OF: Range<usize> = 2..4;
-    /// `u32`: first byte in the arena, a multiple of 4.
+    /// `u32`: first byte in the region, a multiple of 4.
     pub const OFFSET: Range<usize> = 4..8;
     /// `u32`: length.
     pub const LENGTH: Range<usize> = 8..12;
@@ -177,6 +178,17 @@ pub mod known_answer {
     pub const CRCS: usize = 8;
     /// Size of one CRC.
     pub const CRC_BYTES: usize = 4;
+}
+
+/// Length of the image that begins with these bytes, as its header states it; `None` where no image begins.
+pub const fn stated_length(bytes: &[u8]) -> Option<usize> {
+    let Some((_, rest)) = bytes.split_at_checked(header::TOTAL_BYTES.start) else { return None };
+    match (bytes.first_chunk(), rest.first_chunk()) {
+        (Some(magic), Some(total)) if u64::from_le_bytes(*magic) == u64::from_le_bytes(MAGIC) => {
+            Some(index(u32::from_le_bytes(*total)))
+        }
+        _ => None,
+    }
 }
 
 /// `length` rounded up to a multiple of [`ALIGNMENT`].

@@ -4,7 +4,8 @@
 use super::bytes::{u8_at, u16_at, u32_at, u64_at};
 use super::layout::{self, header, region, section, tensor};
 use super::{
-    Check, Image, ParseError, Place, Port, Section, SectionKind, TensorRecord, crc32, ensure, ensure_equal, shown, text,
+    Check, Image, ParseError, Place, Port, Region, RegionName, Section, SectionKind, TensorRecord, crc32, ensure,
+    ensure_equal, shown, text,
 };
 use crate::ops::{self, StepContext};
 use crate::program::Step;
@@ -13,7 +14,7 @@ use core::ops::Range;
 
 pub(super) fn parse(bytes: &[u8]) -> Result<Image<'_>, ParseError> {
     let mut image = read_header(bytes)?;
-    check_regions(&image)?;
+    read_regions(&mut image)?;
     read_sections(&mut image)?;
     check_step_index(&image)?;
     for id in 0..image.tensor_count {
@@ -47,7 +48,6 @@ fn read_header(bytes: &[u8]) -> Result<Image<'_>, ParseError> {
     ensure_equal(Check::TotalBytes, Place::File, length, total)?;
     check_reserved(bytes, header::RESERVED_A)?;
     check_reserved(bytes, header::RESERVED_B)?;
-    check_reserved(bytes, header::REGIONS.start.saturating_add(region::BYTES)..header::REGIONS.end)?;
     let used = section::BYTES.saturating_mul(layout::SECTIONS);
     check_reserved(bytes, header::SECTIONS.start.saturating_add(used)..header::SECTIONS.end)?;
     let name = bytes.get(header::NAME).unwrap_or_default();
@@ -64,19 +64,18 @@ fn check_reserved(bytes: &[u8], field: Range<usize>) -> Result<(), ParseError> {
     ensure(Check::HeaderReserved, at(&field), stray.is_none(), stray.unwrap_or_default(), 0)
 }
 
-/// Features and counts; the sections are still empty.
+/// Features and counts; regions and sections are still empty.
 fn read_counts(bytes: &[u8]) -> Result<Image<'_>, ParseError> {
-    let field = |range: Range<usize>| bytes.get(header::REGIONS).and_then(|slots| u32_at(slots, range));
     let image = Image {
         bytes,
         sections: Default::default(),
         features: u64_at(bytes, header::FEATURES).unwrap_or_default(),
-        arena_bytes: field(region::ARENA_BYTES).unwrap_or_default(),
-        arena_alignment: field(region::ALIGNMENT).unwrap_or_default(),
+        regions: Default::default(),
         step_count: u16_at(bytes, header::STEP_COUNT).unwrap_or_default(),
         tensor_count: u16_at(bytes, header::TENSOR_COUNT).unwrap_or_default(),
         input_count: u8_at(bytes, header::INPUT_COUNT).unwrap_or_default(),
         output_count: u8_at(bytes, header::OUTPUT_COUNT).unwrap_or_default(),
+        region_count: u8_at(bytes, header::REGION_COUNT).unwrap_or_default(),
         work: 0,
     };
     let unknown = image.features & !Step::KNOWN_FEATURES;
@@ -91,17 +90,37 @@ fn read_counts(bytes: &[u8]) -> Result<Image<'_>, ParseError> {
     Ok(image)
 }
 
-/// One region, named `main`.
-fn check_regions(image: &Image<'_>) -> Result<(), ParseError> {
-    let count = u8_at(image.bytes, header::REGION_COUNT).unwrap_or_default();
-    ensure_equal(Check::RegionCount, at(&header::REGION_COUNT), count, 1)?;
-    let slot = image.bytes.get(header::REGIONS).unwrap_or_default();
-    let name = slot.get(region::NAME).unwrap_or_default();
-    let first = name.first().copied().unwrap_or_default();
-    ensure(Check::RegionName, at(&header::REGIONS), name == region::MAIN, first, region::MAIN[0])?;
-    let alignment = image.arena_alignment;
-    let fits = alignment.is_power_of_two() && (16..=layout::MAX_ARENA_ALIGNMENT).contains(&alignment);
-    ensure(Check::RegionAlignment, at(&header::REGIONS), fits, alignment, 16)
+/// One to four regions of distinct names; the slots behind them are zero.
+fn read_regions(image: &mut Image<'_>) -> Result<(), ParseError> {
+    let slots = layout::REGION_SLOTS;
+    let count = usize::from(image.region_count);
+    let place = at(&header::REGION_COUNT);
+    ensure(Check::RegionCount, place, (1..=slots).contains(&count), image.region_count, shown(slots as u64))?;
+    let behind = header::REGIONS.start.saturating_add(region::BYTES.saturating_mul(count.min(slots)));
+    check_reserved(image.bytes, behind..header::REGIONS.end)?;
+    for number in 0..count.min(slots) {
+        let start = header::REGIONS.start.saturating_add(region::BYTES.saturating_mul(number));
+        let place = at(&(start..header::REGIONS.end));
+        let slot = image.bytes.get(start..start.saturating_add(region::BYTES)).unwrap_or_default();
+        let name = slot.get(region::NAME).and_then(|name| RegionName::from_bytes(name.try_into().ok()?));
+        ensure(Check::RegionName, place, name.is_some(), slot.first().copied().unwrap_or_default(), b'm')?;
+        let read = Region {
+            name: name.unwrap_or_default(),
+            bytes: u32_at(slot, region::ARENA_BYTES).unwrap_or_default(),
+            alignment: u32_at(slot, region::ALIGNMENT).unwrap_or_default(),
+        };
+        let earlier = image.regions.iter().take(number).position(|other| other.name == read.name);
+        let same = shown(earlier.unwrap_or(number) as u64);
+        ensure(Check::RegionRepeated, place, earlier.is_none(), same, shown(number as u64))?;
+        let fits = read.alignment.is_power_of_two() && (16..=layout::MAX_ARENA_ALIGNMENT).contains(&read.alignment);
+        ensure(Check::RegionAlignment, place, fits, read.alignment, 16)?;
+        if let Some(known) = image.regions.get_mut(number) {
+            *known = read;
+        }
+        let total = image.regions.iter().fold(0_u64, |sum, region| sum.saturating_add(region.bytes.into()));
+        ensure(Check::RegionBytes, place, total <= u64::from(u32::MAX), shown(total), u32::MAX)?;
+    }
+    Ok(())
 }
 
 /// The section table: gapless, of the lengths that the counts imply, zero-padded; CRCs of all but the two sections
@@ -202,7 +221,8 @@ fn check_tensor(image: &Image<'_>, id: u16) -> Result<(), ParseError> {
     let scratch = record.element == ElementType::Scratch;
     let stray = bytes.get(tensor::RESERVED).unwrap_or_default().iter().copied().find(|byte| *byte != 0);
     ensure(Check::TensorReserved, place, stray.is_none(), stray.unwrap_or_default(), 0)?;
-    ensure_equal(Check::TensorRegion, place, u8_at(bytes, tensor::REGION).unwrap_or_default(), 0)?;
+    let last_region = image.region_count.saturating_sub(1);
+    ensure(Check::TensorRegion, place, record.region <= last_region, record.region, last_region)?;
     let batch = u16_at(bytes, tensor::BATCH).unwrap_or_default();
     ensure_equal(Check::TensorBatch, place, batch, u16::from(!scratch))?;
     let dims = [record.shape.height, record.shape.width, record.shape.channels];
@@ -214,8 +234,8 @@ fn check_tensor(image: &Image<'_>, id: u16) -> Result<(), ParseError> {
     ensure(Check::TensorBytes, place, exact, shown(length), shown(implied.max(1)))?;
     let remainder = index(record.offset) % layout::ARENA_OFFSET_ALIGNMENT;
     ensure_equal(Check::TensorAlignment, place, shown(remainder as u64), 0)?;
-    let inside = record.end() <= u64::from(image.arena_bytes);
-    ensure(Check::TensorInside, place, inside, shown(record.end()), image.arena_bytes)?;
+    let room = image.region(record.region).unwrap_or_default().bytes;
+    ensure(Check::TensorInside, place, record.end() <= u64::from(room), shown(record.end()), room)?;
     let ordered = record.first_step <= record.last_step && record.last_step < image.step_count;
     ensure(Check::TensorLive, place, ordered, record.last_step, image.step_count.saturating_sub(1))?;
     if scratch { check_scratch_use(image, id, &record) } else { check_tensor_use(image, id, &record) }

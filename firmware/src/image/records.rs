@@ -12,7 +12,9 @@ pub struct TensorRecord {
     pub element: ElementType,
     /// Shape; all zero for scratch.
     pub shape: Shape,
-    /// First byte in the arena, a multiple of 4.
+    /// Memory region, by its position in the header.
+    pub region: u8,
+    /// First byte in the region, a multiple of 4.
     pub offset: u32,
     /// Length in bytes, without rounding.
     pub bytes: u32,
@@ -25,11 +27,12 @@ pub struct TensorRecord {
 }
 
 impl TensorRecord {
-    /// Working memory of one step.
+    /// Working memory of one step, in the first region.
     pub const fn scratch(offset: u32, bytes: u32, step: u16) -> Self {
         Self {
             element: ElementType::Scratch,
             shape: Shape { height: 0, width: 0, channels: 0 },
+            region: 0,
             offset,
             bytes,
             first_step: step,
@@ -45,7 +48,7 @@ impl TensorRecord {
 
     /// Whether two buffers share a byte of the arena.
     pub const fn overlaps(&self, other: &Self) -> bool {
-        (self.offset as u64) < other.end() && (other.offset as u64) < self.end()
+        self.region == other.region && (self.offset as u64) < other.end() && (other.offset as u64) < self.end()
     }
 
     /// Whether the buffer holds something at this step.
@@ -58,6 +61,7 @@ impl TensorRecord {
         let mut record = [0; tensor::BYTES];
         let batch = if self.element == ElementType::Scratch { 0_u16 } else { 1 };
         let in_place_of = self.in_place_of.map_or(tensor::NOT_IN_PLACE, |id| id.0);
+        put(&mut record, tensor::REGION, &[self.region]);
         put(&mut record, tensor::ELEMENT, &[self.element as u8]);
         put(&mut record, tensor::IN_PLACE_OF, &in_place_of.to_le_bytes());
         put(&mut record, tensor::OFFSET, &self.offset.to_le_bytes());
@@ -81,6 +85,7 @@ impl TensorRecord {
                 width: bytes::u16_at(record, tensor::WIDTH)?,
                 channels: bytes::u16_at(record, tensor::CHANNELS)?,
             },
+            region: bytes::u8_at(record, tensor::REGION)?,
             offset: bytes::u32_at(record, tensor::OFFSET)?,
             bytes: bytes::u32_at(record, tensor::LENGTH)?,
             first_step: bytes::u16_at(record, tensor::FIRST_STEP)?,

@@ -1,12 +1,11 @@
 //! A step under examination: look-ups in the tensor table, the checks that operators share, and the cut of operands.
 
-use crate::arena::{Changed, Operands, Source, split};
+use crate::arena::{Changed, Operands, Regions, Source, Span};
 use crate::fault::{self, Fault};
 use crate::image::{Check, Image, ParseError, Place, TensorRecord, ensure, layout, shown};
 use crate::program::{Clamp, ConstRange, Requant, Step, Window};
 use crate::tensor::{ElementType, Shape, TensorId, index};
 use bytemuck::Pod;
-use core::ops::Range;
 
 /// An image and the position of one of its steps.
 #[derive(Clone, Copy, Debug)]
@@ -199,7 +198,8 @@ impl StepContext<'_, '_> {
         let operand = self.tensor(id)?;
         // A max pool shrinks its input; every other pair is element for element.
         let sized = operand.bytes == output.bytes || matches!(step, Step::MaxPool(_));
-        let same = operand.offset == output.offset && operand.element == output.element && sized;
+        let placed = (operand.region, operand.offset) == (output.region, output.offset);
+        let same = placed && operand.element == output.element && sized;
         ensure(Check::InPlacePosition, place, same, operand.offset, output.offset)?;
         let last_use = operand.last_step == self.position && !self.image.is_output(id);
         ensure(Check::InPlaceLastUse, place, last_use, operand.last_step, self.position)
@@ -224,37 +224,29 @@ impl StepContext<'_, '_> {
         Ok(())
     }
 
-    /// Cuts output, scratch and operands out of the arena.
-    pub fn operands<'m>(&self, step: &Step, arena: &'m mut [u8]) -> Result<Operands<'m>, Changed> {
+    /// Cuts output, scratch and operands out of the memory regions.
+    pub fn operands<'m>(&self, step: &Step, regions: &'m mut Regions<'_>) -> Result<Operands<'m>, Changed> {
         let output = self.tensor(step.output())?;
-        let mut output_span = span(&output);
+        let mut output_span = Span::of(&output);
         let mut sources = [const { None }; 3];
         for (source, id) in sources.iter_mut().zip(step.reads()) {
             let Some(id) = id else { continue };
             let record = self.tensor(id)?;
             let in_place = output.in_place_of == Some(id);
             if in_place {
-                output_span.end = output_span.end.max(span(&record).end);
+                output_span.bytes.end = output_span.bytes.end.max(Span::of(&record).bytes.end);
             }
-            *source = Some(Source { element: record.element, span: (!in_place).then(|| span(&record)) });
+            *source = Some(Source { element: record.element, span: (!in_place).then(|| Span::of(&record)) });
         }
         let scratch = match step.scratch() {
             Some(id) => scratch_span(&self.tensor(id)?),
-            None => 0..0,
+            None => Span::EMPTY,
         };
-        split(arena, (output.element, output_span), scratch, sources)
+        regions.split((output.element, output_span), scratch, sources)
     }
 }
 
-fn range(offset: u32, bytes: u32) -> Range<usize> {
-    index(offset)..index(offset).saturating_add(index(bytes))
-}
-
-fn span(record: &TensorRecord) -> Range<usize> {
-    range(record.offset, record.bytes)
-}
-
-fn scratch_span(record: &TensorRecord) -> Range<usize> {
+fn scratch_span(record: &TensorRecord) -> Span {
     let early = if fault::active(Fault::ScratchOverlap) { 16 } else { 0 };
-    range(record.offset.saturating_sub(early), record.bytes)
+    Span::of(&TensorRecord { offset: record.offset.saturating_sub(early), ..*record })
 }

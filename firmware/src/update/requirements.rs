@@ -60,7 +60,7 @@ impl Manifest {
             bytes: u32::try_from(image.bytes().len()).unwrap_or(u32::MAX),
             revision: image.revision(),
             features: image.features(),
-            arenas: [image.arena_bytes(), 0, 0, 0],
+            arenas: [0, 1, 2, 3].map(|region| image.region(region).map_or(0, |region| region.bytes)),
             header_crc: image.header_crc(),
             target: image.target().into(),
         }

@@ -10,8 +10,8 @@ use crate::image::{CheckProgress, Cursor, Image};
 use core::fmt;
 use embedded_storage::nor_flash::NorFlash;
 
-/// Writes images into the slot that does not run. Every call does bounded work: at most one sector is erased and one
-/// page written per 256 bytes received.
+/// Writes images into the slot that does not run. Every call does bounded work: [`Updater::begin`] erases at most two
+/// sectors, [`Updater::write`] erases at most one sector and writes one page per 256 bytes received.
 ///
 /// An error from the flash and a refusal abandon the update; a piece out of order does not. Abandoned or cut off, an
 /// update leaves nothing behind that runs, and the next [`Updater::begin`] starts afresh.

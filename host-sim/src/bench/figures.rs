@@ -17,7 +17,7 @@ pub struct BenchReport {
     pub rounds: u32,
     /// Size of the image.
     pub image_bytes: u64,
-    /// Size of the arena.
+    /// Size of the arena in all memory regions together.
     pub arena_bytes: u64,
     /// Most physical memory that this process had at once; `None` where the system does not tell.
     pub peak_memory_bytes: Option<u64>,

@@ -34,7 +34,7 @@ impl<'a> IntegerNetwork<'a> {
         let element = record.map(|record| record.element).ok_or_else(|| {
             Error::new(ErrorCode::Unsupported, format!("network {}", image.name()), "it has no output")
         })?;
-        let arena = GuardedArena::new(image.arena_bytes() as usize, image.arena_alignment() as usize);
+        let arena = GuardedArena::new(&image);
         Ok(Self { image, backend, arena, kind, output, element })
     }
 

@@ -33,7 +33,6 @@ impl Calls {
         let mut calls = Self::default();
         let (start, end) = (function.address, function.address + function.code.len() as u64);
         let mut at = 0;
-        let mut before = 0;
         while at < function.code.len() {
             if let Some(data) = function.data.iter().find(|data| data.contains(&at)) {
                 at = data.end;
@@ -42,12 +41,9 @@ impl Calls {
             let address = start + at as u64;
             let (flow, length) = match set {
                 InstructionSet::Thumb => thumb(&function.code[at..], address),
-                InstructionSet::A64 => {
-                    let word = word(&function.code[at..]);
-                    (a64(word, before, address), 4)
-                }
+                InstructionSet::A64 if is_table_jump(function, at) => (Flow::Next, 4),
+                InstructionSet::A64 => (a64(word(&function.code[at..]), address), 4),
             };
-            before = word(&function.code[at..]);
             match flow {
                 Flow::Call(target) => drop(calls.targets.insert(target)),
                 Flow::Jump(target) if !(start..end).contains(&target) => drop(calls.targets.insert(target)),
@@ -114,8 +110,8 @@ fn thumb(code: &[u8], address: u64) -> (Flow, usize) {
     (flow, 4)
 }
 
-/// Flow of an A64 instruction; `before` is the one before it.
-fn a64(word: u32, before: u32, address: u64) -> Flow {
+/// Flow of an A64 instruction.
+fn a64(word: u32, address: u64) -> Flow {
     match word {
         _ if word & 0xFC00_0000 == 0x9400_0000 => Flow::Call(displaced(address, (word & 0x03FF_FFFF) << 2, 28)),
         _ if word & 0xFC00_0000 == 0x1400_0000 => Flow::Jump(displaced(address, (word & 0x03FF_FFFF) << 2, 28)),
@@ -125,15 +121,40 @@ fn a64(word: u32, before: u32, address: u64) -> Flow {
         }
         // TBZ and TBNZ.
         _ if word & 0x7E00_0000 == 0x3600_0000 => Flow::Jump(displaced(address, (word >> 5 & 0x3FFF) << 2, 16)),
-        // BLR, and BR unless the address was made just before by adding an entry of a table inside the function.
-        _ if word & 0xFFFF_FC1F == 0xD63F_0000 => Flow::Indirect,
-        _ if word & 0xFFFF_FC1F == 0xD61F_0000 => {
-            let register = word >> 5 & 31;
-            let is_sum = before & 0xFF20_0000 == 0x8B00_0000 && before & 31 == register && before >> 5 & 31 == register;
-            if is_sum { Flow::Next } else { Flow::Indirect }
-        }
+        // BLR and BR.
+        _ if word & 0xFFDF_FC1F == 0xD61F_0000 => Flow::Indirect,
         _ => Flow::Next,
     }
+}
+
+/// Instructions that lie at most between the parts of a jump through a table.
+const TABLE_JUMP_REACH: usize = 16;
+
+/// Whether an A64 instruction is the end of a `match`: a BR to a register that holds the sum of an address inside the
+/// function (ADR) and an entry of a table (ADD). Anything else that may write the register in between ends the search.
+fn is_table_jump(function: &Function<'_>, at: usize) -> bool {
+    let last = word(&function.code[at..]);
+    if last & 0xFFFF_FC1F != 0xD61F_0000 {
+        return false;
+    }
+    let register = last >> 5 & 31;
+    let mut has_sum = false;
+    for back in (0..at).rev().step_by(4).map(|end| end - 3).take(TABLE_JUMP_REACH) {
+        let word = word(&function.code[back..]);
+        let [first, second, third] = [word & 31, word >> 5 & 31, word >> 10 & 31];
+        let is_sum = word & 0xFF20_0000 == 0x8B00_0000 && first == register && second == register;
+        if word & 0x9F00_0000 == 0x1000_0000 && first == register {
+            let value = (word >> 5 & 0x7_FFFF) << 2 | word >> 29 & 3;
+            let to = displaced(back as u64, value, 21);
+            return has_sum && to < function.code.len() as u64;
+        }
+        if is_sum && !has_sum {
+            has_sum = true;
+        } else if [first, second, third].contains(&register) || a64(word, 0) != Flow::Next {
+            return false;
+        }
+    }
+    false
 }
 
 #[cfg(test)]
@@ -162,14 +183,30 @@ mod tests {
 
     #[test]
     fn a64_branches_are_decoded() {
-        assert_eq!(a64(0x9400_0002, 0, 0x1000), Flow::Call(0x1008), "bl .+8");
-        assert_eq!(a64(0x17FF_FFFF, 0, 0x1000), Flow::Jump(0xFFC), "b .-4");
-        assert_eq!(a64(0x5400_0040, 0, 0x1000), Flow::Jump(0x1008), "b.eq .+8");
-        assert_eq!(a64(0xB400_0040, 0, 0x1000), Flow::Jump(0x1008), "cbz x0, .+8");
-        assert_eq!(a64(0x3600_0040, 0, 0x1000), Flow::Jump(0x1008), "tbz w0, #0, .+8");
-        assert_eq!(a64(0xD63F_0100, 0, 0x1000), Flow::Indirect, "blr x8");
-        assert_eq!(a64(0xD61F_0100, 0, 0x1000), Flow::Indirect, "br x8");
-        assert_eq!(a64(0xD61F_0100, 0x8B09_0908, 0x1000), Flow::Next, "add x8, x8, x9, lsl #2; br x8");
-        assert_eq!(a64(0xD65F_03C0, 0, 0x1000), Flow::Next, "ret");
+        assert_eq!(a64(0x9400_0002, 0x1000), Flow::Call(0x1008), "bl .+8");
+        assert_eq!(a64(0x17FF_FFFF, 0x1000), Flow::Jump(0xFFC), "b .-4");
+        assert_eq!(a64(0x5400_0040, 0x1000), Flow::Jump(0x1008), "b.eq .+8");
+        assert_eq!(a64(0xB400_0040, 0x1000), Flow::Jump(0x1008), "cbz x0, .+8");
+        assert_eq!(a64(0x3600_0040, 0x1000), Flow::Jump(0x1008), "tbz w0, #0, .+8");
+        assert_eq!(a64(0xD63F_0100, 0x1000), Flow::Indirect, "blr x8");
+        assert_eq!(a64(0xD61F_0100, 0x1000), Flow::Indirect, "br x8");
+        assert_eq!(a64(0xD65F_03C0, 0x1000), Flow::Next, "ret");
+    }
+
+    #[test]
+    fn a_match_is_no_indirect_call() {
+        let indirect = |words: &[u32]| {
+            let code: Vec<u8> = words.iter().flat_map(|word| word.to_le_bytes()).collect();
+            let function =
+                Function { name: "f".into(), address: 0x1000, code: &code, data: Vec::new(), frame: Some(0) };
+            Calls::of(&function, InstructionSet::A64).indirect
+        };
+        // adr x10, .+16; ldrb w11, [x9, x8]; add x10, x10, x11, lsl #2; mov x0, x20; br x10
+        let (adr, ldrb, add, mov, br) = (0x1000_008A, 0x3868_692B, 0x8B0B_094A, 0xAA14_03E0, 0xD61F_0140);
+        assert_eq!(indirect(&[adr, ldrb, add, mov, br]), 0);
+        assert_eq!(indirect(&[adr, ldrb, mov, br]), 1, "no entry of a table");
+        assert_eq!(indirect(&[ldrb, add, mov, br]), 1, "of an unknown address");
+        assert_eq!(indirect(&[adr, ldrb, add, 0xF940_0D0A, br]), 1, "ldr x10, [x8, #24]");
+        assert_eq!(indirect(&[0x1001_000A, ldrb, add, mov, br]), 1, "adr x10 beyond the function");
     }
 }

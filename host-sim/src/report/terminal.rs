@@ -144,6 +144,12 @@ pub fn summary(report: &VerifyReport) -> String {
         s.arena_bound_bytes,
         s.arena_status.words()
     );
+    for region in &report.memory.regions {
+        let of = region.capacity_bytes.map(|capacity| format!(" of {capacity} B")).unwrap_or_default();
+        let (bytes, bound, share) = (region.bytes, region.bound_bytes, 100.0 * region.traffic_share);
+        let figures = format!("{bytes} B{of}, lower bound {bound} B: {}", region.status.words());
+        let _ = writeln!(text, "  in {:<19} {figures}; {share:.1} % of the traffic", region.name);
+    }
     let _ = writeln!(text, "flash                  {} B", s.flash_bytes);
     text
 }

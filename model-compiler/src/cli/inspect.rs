@@ -2,12 +2,15 @@
 
 use crate::artifact::{self, hex};
 use crate::emit::AlignedBytes;
-use crate::error::{Error, Result};
+use crate::error::{Error, ErrorCode, Result};
+use crate::flash;
 use crate::import::{NamedTensors, System, checkpoint, onnx};
+use crate::memory_plan::MemoryPlan;
+use crate::pipeline;
 use crate::qmodel::QModel;
 use crate::record::Record;
 use comfy_table::{CellAlignment, Table, presets};
-use firmware::image::{Image, SectionKind, layout};
+use firmware::image::{Image, SectionKind, TensorRecord, layout};
 use firmware::tensor::ElementType;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -19,7 +22,7 @@ use std::path::Path;
 pub fn inspect(path: &Path) -> Result<String> {
     let bytes = std::fs::read(path).map_err(|e| Error::io(path, &e))?;
     let result = if bytes.starts_with(&layout::MAGIC) {
-        image(&bytes)
+        image(&bytes, plan_beside(path, &bytes).as_ref())
     } else if artifact::is::<QModel>(&bytes) {
         artifact::from_bytes(&bytes).map(|model| qmodel(&model))
     } else if artifact::is::<Record>(&bytes) {
@@ -27,6 +30,9 @@ pub fn inspect(path: &Path) -> Result<String> {
     } else if onnx::is_onnx(&bytes) {
         let digest = hex(&artifact::sha256(&bytes));
         onnx::Model::parse(bytes).map(|model| network(&model, &digest))
+    } else if let Some(form) = flash::form(&bytes) {
+        let error = Error::new(ErrorCode::Unsupported, "", format!("this is {form}, a form of an image"));
+        Err(error.with_help("inspect the .img that it was made of"))
     } else {
         checkpoint::parse(&bytes).map(|checkpoint| tensors(&checkpoint))
     };
@@ -34,7 +40,7 @@ pub fn inspect(path: &Path) -> Result<String> {
 }
 
 /// A plain table: headers, then rows; every column after the first `left` ones is aligned right.
-fn table(headers: &[&str], left: usize) -> Table {
+pub(super) fn table(headers: &[&str], left: usize) -> Table {
     let mut table = Table::new();
     table.load_style(presets::NOTHING).set_header(headers);
     for (index, column) in table.column_iter_mut().enumerate() {
@@ -52,7 +58,13 @@ fn element_name(element: ElementType) -> &'static str {
     }
 }
 
-fn image(bytes: &[u8]) -> Result<String> {
+/// The plan of an image whose record lies beside it: an image alone does not know what its regions could hold.
+fn plan_beside(path: &Path, image: &[u8]) -> Option<MemoryPlan> {
+    let record: Record = artifact::read(&pipeline::record_path(path)).ok()?;
+    (record.image_sha256 == artifact::sha256(image)).then_some(record.plan)
+}
+
+fn image(bytes: &[u8], plan: Option<&MemoryPlan>) -> Result<String> {
     let mut text = String::new();
     let aligned = AlignedBytes::from(bytes);
     let image = Image::parse(&aligned)?;
@@ -87,16 +99,22 @@ fn image(bytes: &[u8]) -> Result<String> {
 
     let records: Vec<_> =
         (0..image.tensor_count()).filter_map(|i| image.tensor(firmware::tensor::TensorId(i))).collect();
-    let mut steps = table(&["op", "output", "shape", "step", "offset", "bytes", "live to", "live bytes"], 3);
+    if let [_, _, ..] = image.regions().collect::<Vec<_>>().as_slice() {
+        let _ = writeln!(text, "{}\n", regions(&image, &records, plan).trim_fmt());
+    }
+    let columns = ["op", "output", "shape", "region", "step", "offset", "bytes", "live to", "live bytes"];
+    let mut steps = table(&columns, 4);
     for position in 0..image.step_count() {
         let Some(step) = image.step(position) else { continue };
         let Some(output) = image.tensor(step.output()) else { continue };
-        let live: u64 = live_bytes(&records, position);
+        let live: u64 = (0..image.region_count()).map(|region| live_bytes(&records, region, position)).sum();
         let shape = output.shape;
+        let region = image.region(output.region).unwrap_or_default();
         steps.add_row([
             step.name().to_owned(),
             element_name(output.element).to_owned(),
             format!("{}×{}×{}", shape.height, shape.width, shape.channels),
+            region.name.to_string(),
             position.to_string(),
             output.offset.to_string(),
             output.bytes.to_string(),
@@ -105,15 +123,41 @@ fn image(bytes: &[u8]) -> Result<String> {
         ]);
     }
     let _ = writeln!(text, "{}", steps.trim_fmt());
-    let bound = (0..image.step_count()).map(|p| live_bytes(&records, p)).max().unwrap_or(0);
-    let _ = writeln!(text, "\narena {} B, largest live sum {bound} B", image.arena_bytes());
+    for (number, region) in (0..).zip(image.regions()) {
+        let bound = largest_live_sum(&image, &records, number);
+        let _ = writeln!(text, "\narena {} {} B, largest live sum {bound} B", region.name, region.bytes);
+    }
     Ok(text)
 }
 
-/// Arena bytes that hold something at a step: the union of the live buffers (buffers that share memory count once).
-fn live_bytes(records: &[firmware::image::TensorRecord], position: u16) -> u64 {
-    let mut ranges: Vec<(u64, u64)> =
-        records.iter().filter(|r| r.is_live(position)).map(|r| (u64::from(r.offset), r.end())).collect();
+/// A row per region; what a region could hold, and how much of the traffic it has, only a record knows.
+fn regions(image: &Image<'_>, records: &[TensorRecord], plan: Option<&MemoryPlan>) -> Table {
+    let mut rows = table(&["region", "bytes", "aligned to", "largest live sum", "capacity", "traffic"], 1);
+    for (number, region) in (0..).zip(image.regions()) {
+        let part = plan.and_then(|plan| Some((plan, plan.regions.get(usize::from(number))?)));
+        let capacity = part.and_then(|(_, part)| part.capacity).map(|bytes| bytes.to_string());
+        let share = part.map(|(plan, part)| format!("{:.1} %", 100.0 * plan.traffic_share(part)));
+        rows.add_row([
+            region.name.to_string(),
+            region.bytes.to_string(),
+            region.alignment.to_string(),
+            largest_live_sum(image, records, number).to_string(),
+            capacity.unwrap_or_default(),
+            share.unwrap_or_default(),
+        ]);
+    }
+    rows
+}
+
+fn largest_live_sum(image: &Image<'_>, records: &[TensorRecord], region: u8) -> u64 {
+    (0..image.step_count()).map(|position| live_bytes(records, region, position)).max().unwrap_or(0)
+}
+
+/// Bytes of a region that hold something at a step: the union of the live buffers (buffers that share memory count
+/// once).
+fn live_bytes(records: &[TensorRecord], region: u8, position: u16) -> u64 {
+    let live = records.iter().filter(|r| r.region == region && r.is_live(position));
+    let mut ranges: Vec<(u64, u64)> = live.map(|r| (u64::from(r.offset), r.end())).collect();
     ranges.sort_unstable();
     let (mut covered, mut sum) = (0, 0);
     for (start, end) in ranges {
@@ -152,8 +196,19 @@ fn build_record(record: &Record) -> String {
     let mut text = String::new();
     let _ = writeln!(text, "build record     image {}", hex(&record.image_sha256));
     let _ = writeln!(text, "target           {}", record.target);
-    let (arena, bound) = (record.plan.arena_bytes, record.plan.bound_bytes);
-    let _ = writeln!(text, "arena            {arena} B, bound {bound} B: {}\n", record.plan.status.words());
+    let plan = &record.plan;
+    let (arena, bound) = (plan.arena_bytes(), plan.bound_bytes());
+    let _ = writeln!(text, "arena            {arena} B, bound {bound} B: {}\n", plan.status().words());
+    if plan.regions.len() > 1 {
+        let mut rows = table(&["region", "bytes", "capacity", "bound", "traffic", ""], 1);
+        for part in &plan.regions {
+            let capacity = part.capacity.map(|bytes| bytes.to_string()).unwrap_or_default();
+            let share = format!("{:.1} %", 100.0 * plan.traffic_share(part));
+            let (bytes, bound) = (part.bytes.to_string(), part.bound_bytes.to_string());
+            rows.add_row([part.name.clone(), bytes, capacity, bound, share, part.status.words().to_owned()]);
+        }
+        let _ = writeln!(text, "{}\n", rows.trim_fmt());
+    }
     text + &qmodel(&record.model)
 }
 

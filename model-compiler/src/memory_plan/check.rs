@@ -1,13 +1,13 @@
 //! The checker: judges a finished plan from the model alone, without the solver's data.
 
 use super::in_place::overwritable;
-use super::needs::{scratch_bytes, scratch_room, tensor_bytes};
+use super::needs::{scratch_bytes, tensor_bytes};
 use super::{MemoryPlan, Placement, PlanStatus, SCRATCH_ALIGNMENT};
 use crate::qmodel::{QModel, QTensorId};
 
 /// Verifies that a plan computes what the model computes: the order runs; live ranges, sizes and scratch are right;
-/// every in-place pair is legal; no two buffers that are live together overlap; everything is aligned and inside the
-/// arena; the bound and the status are true.
+/// every in-place pair is legal; no two buffers that are live together overlap; everything is aligned and inside its
+/// region; the bound and the status of every region are true.
 ///
 /// It does not prove that a plan of status [`PlanStatus::OptimalBoundNotReachable`] is optimal.
 ///
@@ -115,15 +115,19 @@ impl<'a> Checker<'a> {
     }
 
     fn size(&mut self, name: String, placement: &Placement, expected: u64, alignment: u64) {
-        let Placement { offset, bytes, .. } = *placement;
+        let Placement { region, offset, bytes, .. } = *placement;
         if bytes != expected {
             self.problems.push(format!("{name}: {bytes} bytes, expected {expected}"));
         }
         if !offset.is_multiple_of(alignment) {
             self.problems.push(format!("{name}: offset {offset} is not a multiple of {alignment}"));
         }
-        if offset.checked_add(bytes).is_none_or(|end| end > self.plan.arena_bytes) {
-            self.problems.push(format!("{name}: {offset} + {bytes} is outside the arena of {}", self.plan.arena_bytes));
+        let Some(part) = self.plan.regions.get(usize::from(region)) else {
+            self.problems.push(format!("{name}: there is no region {region}"));
+            return;
+        };
+        if offset.checked_add(bytes).is_none_or(|end| end > part.bytes) {
+            self.problems.push(format!("{name}: {offset} + {bytes} is outside the arena of {}", part.bytes));
         }
     }
 
@@ -142,7 +146,7 @@ impl<'a> Checker<'a> {
             if taken.last_step != position || self.model.outputs.iter().any(|p| p.tensor == operand) {
                 self.problems.push(format!("{name}: takes over {operand_name}, which is needed later"));
             }
-            if taken.offset != placement.offset {
+            if (taken.region, taken.offset) != (placement.region, placement.offset) {
                 self.problems.push(format!("{name}: not at the offset of {operand_name}, which it takes over"));
             }
         }
@@ -151,10 +155,11 @@ impl<'a> Checker<'a> {
     fn overlaps(&mut self) {
         for position in 0..self.plan.order.len() as u32 {
             let mut live = self.live_at(position);
-            live.sort_by_key(|l| l.placement.offset);
+            let start = |l: &Live<'_>| (l.placement.region, l.placement.offset);
+            live.sort_by_key(start);
             for (i, low) in live.iter().enumerate() {
-                let end = low.placement.offset.saturating_add(low.placement.bytes);
-                let above = live[i + 1..].iter().take_while(|high| high.placement.offset < end);
+                let end = (low.placement.region, low.placement.offset.saturating_add(low.placement.bytes));
+                let above = live[i + 1..].iter().take_while(|high| start(high) < end);
                 for high in above.filter(|high| !is_pair(low, high, position) && !is_pair(high, low, position)) {
                     let (a, b) = (self.name(low, position), self.name(high, position));
                     self.problems.push(format!("{a} and {b} overlap at position {position}"));
@@ -164,30 +169,22 @@ impl<'a> Checker<'a> {
     }
 
     fn bound(&mut self) {
-        let positions = 0..self.plan.order.len() as u32;
-        let bound = positions.clone().map(|p| self.live_sum(p)).max().unwrap_or(0);
-        let plan = self.plan;
-        if plan.bound_bytes != bound {
-            self.problems.push(format!("bound {}, expected {bound}", plan.bound_bytes));
+        let (plan, positions) = (self.plan, 0..self.plan.order.len() as u32);
+        for (number, part) in (0_u8..).zip(&plan.regions) {
+            let name = &part.name;
+            let bound = positions.clone().map(|p| plan.live_bytes(number, p)).max().unwrap_or(0);
+            if part.bound_bytes != bound {
+                self.problems.push(format!("region {name}: bound {}, expected {bound}", part.bound_bytes));
+            }
+            let at_peak = positions.contains(&part.peak_step).then(|| plan.live_bytes(number, part.peak_step));
+            if !plan.order.is_empty() && at_peak != Some(bound) {
+                self.problems.push(format!("region {name}: position {} is not the peak", part.peak_step));
+            }
+            if (part.status == PlanStatus::Optimal) != (part.bytes == bound) {
+                let found = format!("{:?} with arena {} and bound {bound}", part.status, part.bytes);
+                self.problems.push(format!("region {name}: {found}"));
+            }
         }
-        let at_peak = positions.contains(&plan.peak_step).then(|| self.live_sum(plan.peak_step));
-        if !plan.order.is_empty() && at_peak != Some(bound) {
-            self.problems.push(format!("position {} is not the peak", plan.peak_step));
-        }
-        if (plan.status == PlanStatus::Optimal) != (plan.arena_bytes == bound) {
-            self.problems.push(format!("{:?} with arena {} and bound {bound}", plan.status, plan.arena_bytes));
-        }
-    }
-
-    /// Rounded bytes live at a position; what is written in place there is counted once.
-    fn live_sum(&self, position: u32) -> u64 {
-        let alignment = u64::from(self.plan.alignment).max(1);
-        let room = |l: Live<'_>| match l.tensor {
-            None => scratch_room(l.placement.bytes, alignment),
-            Some(_) if l.placement.in_place_of.is_some() && l.placement.first_step == position => 0,
-            Some(_) => l.placement.bytes.next_multiple_of(alignment),
-        };
-        self.live_at(position).into_iter().map(room).sum()
     }
 
     fn live_at(&self, position: u32) -> Vec<Live<'a>> {

@@ -1,6 +1,7 @@
 //! What schedule and placement need to know of a model: sizes, readers, scratch, and what may be overwritten.
 
 use super::in_place::overwritable;
+use super::traffic::traffic;
 use super::{LiveRange, Pairs, PlanOptions, SCRATCH_ALIGNMENT};
 use crate::error::{Error, ErrorCode, Result};
 use crate::qmodel::{QModel, QOp, QTensorId};
@@ -29,6 +30,10 @@ pub(crate) struct Needs {
     pub kernels: Vec<Option<KernelId>>,
     /// Exact scratch bytes per step.
     pub scratch: Vec<u64>,
+    /// Bytes read from and written to each tensor in an inference.
+    pub tensor_traffic: Vec<u64>,
+    /// The same of the scratch of each step.
+    pub scratch_traffic: Vec<u64>,
     /// Of tensors, bytes.
     pub alignment: u64,
 }
@@ -61,6 +66,7 @@ impl Needs {
         let kernels: Vec<_> = model.steps.iter().map(|s| kernel(model, target, &s.op)).collect();
         let scratch =
             model.steps.iter().zip(&kernels).map(|(s, kernel)| scratch_bytes(model, &s.op, *kernel)).collect();
+        let (tensor_traffic, scratch_traffic) = traffic(model, &kernels);
         Ok(Self {
             tensor_bytes: exact_bytes.iter().map(|b| b.next_multiple_of(alignment)).collect(),
             exact_bytes,
@@ -71,6 +77,8 @@ impl Needs {
             overwritable: model.steps.iter().map(|s| operands(&s.op)).collect(),
             kernels,
             scratch,
+            tensor_traffic,
+            scratch_traffic,
             alignment,
         })
     }

@@ -2,7 +2,7 @@
 
 #![allow(dead_code, reason = "each test uses its own subset")]
 
-use firmware::image::TensorRecord;
+use firmware::image::{Region, RegionName, TensorRecord};
 use firmware::kernels::plan;
 use firmware::program::*;
 use firmware::tensor::{ElementType, Shape, TensorId};
@@ -170,8 +170,7 @@ pub fn parts() -> ImageParts {
             port("controls", ids::CONTROLS),
             ImagePort { scale: 1.0 / 64.0, ..port("points", ids::POINTS) },
         ],
-        arena_bytes,
-        arena_alignment: 16,
+        regions: vec![Region { name: RegionName::MAIN, bytes: arena_bytes, alignment: 16 }],
         target: "cortex-m4".into(),
         revision: 3,
         qmodel_digest: [7; 32],
@@ -522,6 +521,7 @@ fn place(shapes: &[(Shape, ElementType)], steps: &mut [Step]) -> Vec<TensorRecor
             TensorRecord {
                 element: *element,
                 shape: *shape,
+                region: 0,
                 offset: 0,
                 bytes: shape.elements() as u32 * element.bytes(),
                 first_step: first,

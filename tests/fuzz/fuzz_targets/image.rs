@@ -3,8 +3,9 @@
 //! The CRCs are recomputed first, or no change would ever get past them.
 #![no_main]
 
+use firmware::arena::Regions;
 use firmware::engine::Engine;
-use firmware::image::Image;
+use firmware::image::{Image, layout};
 use firmware::kernels::Portable;
 use libfuzzer_sys::fuzz_target;
 use model_compiler::emit::{AlignedBytes, reseal};
@@ -12,7 +13,7 @@ use model_compiler::emit::{AlignedBytes, reseal};
 /// Accepted images beyond these are not run: each run is to take microseconds.
 const MAX_WORK: u64 = 1 << 20;
 const MAX_ARENA: u32 = 1 << 18;
-/// Untouched bytes on both sides of the arena; a multiple of every arena alignment.
+/// Untouched bytes on both sides of each region's arena; a multiple of every alignment.
 const GUARD: usize = 4096;
 
 fuzz_target!(|bytes: &[u8]| {
@@ -28,11 +29,19 @@ fuzz_target!(|bytes: &[u8]| {
 
 fn run(image: Image<'_>) {
     let size = image.arena_bytes() as usize;
-    let mut memory = AlignedBytes::zeroed(size + 3 * GUARD);
+    let mut memory = AlignedBytes::zeroed(size + (2 * layout::REGION_SLOTS + 2) * GUARD);
     memory.fill(0xA5);
     let start = GUARD + memory.as_ptr().align_offset(GUARD);
-    let (before, rest) = memory.split_at_mut(start);
-    let (arena, behind) = rest.split_at_mut(size);
+    let (before, mut rest) = memory.split_at_mut(start);
+    let mut guards = vec![before];
+    let mut cut = |bytes: usize| {
+        let (here, behind) = std::mem::take(&mut rest).split_at_mut(bytes.next_multiple_of(GUARD) + GUARD);
+        rest = behind;
+        let (arena, guard) = here.split_at_mut(bytes);
+        guards.push(guard);
+        arena
+    };
+    let arena: Regions<'_> = image.regions().map(|region| cut(region.bytes as usize)).collect();
     let noise: Vec<u8> = (0..size).map(|i| (i * 167 + (i >> 8)) as u8).collect();
     let records = (0..image.input_count()).map(|i| image.input(i).and_then(|port| image.tensor(port.tensor)));
     let inputs: Vec<&[u8]> = records.map(|record| &noise[..record.expect("a tensor").bytes as usize]).collect();
@@ -41,5 +50,5 @@ fn run(image: Image<'_>) {
     for output in 0..image.output_count() {
         engine.output(output.into()).expect("an accepted image gives its outputs");
     }
-    assert!(before.iter().chain(&*behind).all(|byte| *byte == 0xA5), "wrote outside the arena");
+    assert!(guards.iter().all(|guard| guard.iter().all(|byte| *byte == 0xA5)), "wrote outside the arena");
 }

@@ -103,13 +103,13 @@ impl ImageStore for Store {
 }
 
 /// Whatever the line, the clock, the image and the arena are.
-pub fn compute(image: &[u8], arena: &mut [u8]) -> bool {
+pub fn compute(image: &[u8], arena: [&mut [u8]; 2]) -> bool {
     let (mut memory, mut line) = (Memory::new(), Line::new());
     let mut actuators = Actuators { steering: Output, throttle: Output, brake: Output, enable: Output };
     let computer = Computer {
         image,
         kernels: Portable,
-        arena,
+        arena: arena.into(),
         memory: black_box(&mut memory),
         line: black_box(&mut line),
         board: &mut Unknown,

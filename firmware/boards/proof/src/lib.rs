@@ -18,7 +18,7 @@ fn panic(_: &PanicInfo<'_>) -> ! {
 }
 
 /// Everything from an image to waypoints.
-pub fn infer(image: &[u8], arena: &mut [u8], inputs: &[&[u8]]) -> Option<()> {
+pub fn infer(image: &[u8], arena: [&mut [u8]; 2], inputs: &[&[u8]]) -> Option<()> {
     let image = Image::parse(image).ok()?;
     image.check().ok()?;
     let mut engine = Engine::new(image, Portable, arena).ok()?;

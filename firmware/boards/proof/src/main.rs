@@ -23,11 +23,11 @@ use update::Flash;
 /// What a boot loader would call. Nothing is known of the image, the arena and the inputs.
 #[unsafe(no_mangle)]
 pub extern "C" fn start() -> bool {
-    let mut arena = [0; 64];
-    infer(black_box(&[]), black_box(&mut arena), black_box(&[])).is_some()
+    let [mut fast, mut main] = [[0; 64]; 2];
+    infer(black_box(&[]), [black_box(&mut fast), black_box(&mut main)], black_box(&[])).is_some()
         & sense(black_box(&Raw::default())).is_some()
         & drive(black_box(&Trip::default()))
-        & computer::compute(black_box(&[]), black_box(&mut arena))
+        & computer::compute(black_box(&[]), [black_box(&mut fast), black_box(&mut main)])
         & update::receive(black_box(Flash::default()), black_box(&[])).is_some()
 }
 

@@ -2,7 +2,7 @@
 
 use crate::memory_flash::MemoryFlash;
 use core::slice;
-use firmware::image::layout::header;
+use firmware::image::layout;
 
 /// Memory that holds model images; taken either as they lie there, or as a flash that is written, too.
 #[derive(Debug)]
@@ -25,8 +25,7 @@ impl ImageMemory {
     pub fn stored(self) -> (&'static [u8], &'static [u8]) {
         // SAFETY: `new` demands memory here that is ours alone, and nothing writes it from now on.
         let memory = unsafe { slice::from_raw_parts(self.base as *const u8, self.bytes as usize) };
-        let stated = memory.get(header::TOTAL_BYTES).and_then(|field| field.try_into().ok()).map(u32::from_le_bytes);
-        let length = stated.and_then(|bytes| usize::try_from(bytes).ok()).unwrap_or(0);
+        let length = layout::stated_length(memory).unwrap_or(0);
         memory.split_at_checked(length).unwrap_or((memory, &[]))
     }
 

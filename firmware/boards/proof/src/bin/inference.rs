@@ -9,5 +9,5 @@ use proof::infer;
 /// What a boot loader would call.
 #[unsafe(no_mangle)]
 pub extern "C" fn start() -> bool {
-    infer(black_box(&[]), black_box(&mut [0; 64]), black_box(&[])).is_some()
+    infer(black_box(&[]), [black_box(&mut [0; 64]), black_box(&mut [0; 64])], black_box(&[])).is_some()
 }

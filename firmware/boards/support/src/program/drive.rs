@@ -49,6 +49,7 @@ pub fn run<U: Uart, C: Counter, K: Kernels + Copy>(board: Board<U, C, K>, worksp
     let mut store = Updater::new(flash, slots, requirements, selected);
     let mut actuators =
         Actuators { steering: Pwm::new(0), throttle: Pwm::new(1), brake: Pwm::new(2), enable: Pin::new(0) };
+    let arena = arena.into();
     let (board, actuators, store) = (&mut machine, &mut actuators, &mut store);
     match (Computer { image, kernels, arena, memory, line, board, actuators, store }).run() {
         Exit::Halt => 0,

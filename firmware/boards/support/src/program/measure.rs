@@ -78,7 +78,8 @@ fn measure<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -
     let frames = frames.chunks_exact(frame_bytes).take(usize::try_from(count).unwrap_or(0));
     let made = [Inputs::Zero, Inputs::Lowest, Inputs::Highest].into_iter().chain(SEEDS.map(Inputs::Noise));
 
-    let (mut steps, mut whole) = ([Span::NONE; MAX_STEPS], Span::NONE);
+    let mut steps = [Span::NONE; MAX_STEPS];
+    let mut whole = Span::NONE;
     let mark = Mark::new();
     let mut runs = 0;
     for inputs in made.chain(frames.map(Inputs::Frame)) {
