@@ -184,7 +184,7 @@ fn a_delay_changes_nothing() {
 #[test]
 fn answers_that_are_lost_or_damaged_are_told() {
     let drive = Drive::new();
-    // Answers before the third frame's: one per request, telemetry of the first frame, output and telemetry of the next.
+    // Before the third frame's answers: one per request, telemetry of the first, output and telemetry of the second.
     let answer = BEFORE + 1 + 2;
     for (happen, expected) in [
         ((|bytes| bytes[2] ^= 0x10) as fn(&mut Vec<u8>), "an answer is damaged: packet with a wrong CRC"),
