@@ -109,7 +109,7 @@ pub(super) struct Sensed {
 pub(super) struct Rig<'m> {
     inputs: Vec<Input, { MAX_PORTS as usize }>,
     cameras: Vec<Camera<'m>, MAX_CAMERAS>,
-    /// Whether the cameras' map has a channel for the goal.
+    /// Whether the goal belongs in the cameras' map.
     draws_goal: bool,
     mounting: Mounting,
     sweep: Option<Sweep>,
@@ -136,7 +136,7 @@ impl<'m> Rig<'m> {
             ports.find(|port| port.name == name).and_then(|port| image.tensor(port.tensor)).map(|record| record.shape)
         };
         let map = shape("views").or(shape("rgb"));
-        rig.draws_goal = shape("views").is_some_and(|shape| shape == heatmap::MAP);
+        rig.draws_goal = shape("views").is_some();
         let views = if shape("views").is_some() { &View::LBC[..] } else { &View::LBC[..1] };
         for (view, memory) in views.iter().zip(cameras).filter(|_| map.is_some()) {
             let layout = camera_layout(configuration, map.unwrap_or(Shape::map(0, 0, 0)), *view);

@@ -2,7 +2,8 @@
 
 use super::line::Line;
 use model_compiler::error::{Error, ErrorCode, Result};
-use std::io::Read;
+use std::io::{ErrorKind, Read};
+use std::net::{Ipv4Addr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::thread::{self, JoinHandle};
@@ -13,6 +14,8 @@ use tempfile::NamedTempFile;
 const PROGRAM: &str = "drive";
 /// Nanoseconds of virtual time per instruction under `-icount shift=6`: clocks count instructions exactly.
 const NANOSECONDS_PER_INSTRUCTION: u64 = 64;
+/// How long the emulator has to connect to its line; it does so before it runs anything.
+const CONNECTION: Duration = Duration::from_secs(60);
 /// How often a wait for the end looks.
 const GLANCE: Duration = Duration::from_millis(20);
 
@@ -119,8 +122,8 @@ pub struct Emulator {
 }
 
 impl Emulator {
-    /// Starts a board with an image in its memory: the emulator, and the line to its UART. What the
-    /// program writes by semihosting goes to a file.
+    /// Starts a board with an image in its memory: the emulator, and the line to its UART, a connection within this
+    /// machine. What the program writes by semihosting comes from the emulator's own output and goes to a file.
     ///
     /// # Errors
     /// Program or emulator is missing.
@@ -129,24 +132,29 @@ impl Emulator {
         if !program.is_file() {
             return Err(board.no_program(&program));
         }
-        let log = NamedTempFile::new().map_err(|e| Error::io(&std::env::temp_dir(), &e))?;
+        let temporary = |e| Error::io(&std::env::temp_dir(), &e);
+        let log = NamedTempFile::new().map_err(temporary)?;
+        let output = log.reopen().map_err(temporary)?;
+        let no_line = |e: std::io::Error| Error::new(ErrorCode::Link, board.name(), format!("no line: {e}"));
+        let listener = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).map_err(no_line)?;
+        let port = listener.local_addr().map_err(no_line)?.port();
         let mut child = Command::new(board.emulator())
             .arg("-M")
             .args(board.machine())
-            .args(["-display", "none", "-monitor", "none", "-serial", "stdio", "-icount", "shift=6", "-device"])
+            .args(["-display", "none", "-monitor", "none", "-icount", "shift=6", "-device"])
             .arg(format!("loader,file={},addr={:#x},force-raw=on", escaped(image), board.image_address()))
-            .args(["-semihosting-config", "enable=on,target=native,chardev=log", "-chardev"])
-            .arg(format!("file,id=log,path={}", escaped(log.path())))
+            .args(["-semihosting-config", "enable=on,target=native", "-serial", "chardev:line", "-chardev"])
+            .arg(format!("socket,id=line,host=127.0.0.1,port={port},nodelay=on"))
             .arg("-kernel")
             .arg(&program)
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
+            .stdin(Stdio::null())
+            .stdout(output)
             .stderr(Stdio::piped())
             .spawn()
             .map_err(|e| board.no_emulator(&e))?;
-        let streams = (child.stdin.take(), child.stdout.take(), child.stderr.take());
+        let errors = child.stderr.take();
         let mut emulator = Self { board, child, errors: None, log, program };
-        let (Some(to_board), Some(from_board), Some(mut errors)) = streams else {
+        let Some(mut errors) = errors else {
             return Err(Error::new(ErrorCode::Link, board.name(), "the emulator has no streams"));
         };
         emulator.errors = Some(thread::spawn(move || {
@@ -155,7 +163,32 @@ impl Emulator {
             let _ = errors.read_to_end(&mut text);
             String::from_utf8_lossy(&text).into_owned()
         }));
+        let from_board = emulator.connection(&listener)?;
+        let to_board = from_board.try_clone().map_err(no_line)?;
         Ok((emulator, Line::new(board.name(), from_board, to_board)))
+    }
+
+    /// The emulator's connection to the line.
+    fn connection(&mut self, listener: &TcpListener) -> Result<TcpStream> {
+        let name = self.board.name();
+        let failed = |e: std::io::Error| Error::new(ErrorCode::Link, name, format!("no line: {e}"));
+        listener.set_nonblocking(true).map_err(failed)?;
+        let begin = Instant::now();
+        loop {
+            match listener.accept() {
+                Ok((stream, _)) => {
+                    stream.set_nonblocking(false).map_err(failed)?;
+                    stream.set_nodelay(true).map_err(failed)?;
+                    stream.set_read_timeout(Some(GLANCE)).map_err(failed)?;
+                    return Ok(stream);
+                }
+                Err(error) if error.kind() == ErrorKind::WouldBlock && begin.elapsed() < CONNECTION => {}
+                Err(error) => return Err(failed(error)),
+            }
+            if let Some(status) = self.wait(GLANCE) {
+                return Err(self.ended(status));
+            }
+        }
     }
 
     /// The program that runs on the board.
