@@ -19,6 +19,7 @@ use model_compiler::cli::{CompletionArgs, ImportArgs, progress_bar};
 use model_compiler::error::{Error, ErrorCode, Result};
 use std::ffi::OsString;
 use std::path::PathBuf;
+use update::UpdateArgs;
 use verify::VerifyArgs;
 
 mod attention;
@@ -28,6 +29,7 @@ mod examples;
 mod footprint;
 mod gates;
 mod hil;
+mod update;
 mod verify;
 
 pub use model_compiler::cli::Console;
@@ -128,6 +130,17 @@ enum Command {
     Hil {
         #[command(flatten)]
         hil: HilArgs,
+        #[command(flatten)]
+        common: Common,
+    },
+    /// Sends a board a new model image: checked there, started on trial, confirmed by its known answer.
+    ///
+    /// The old image runs until the new one is whole, and again if the new one fails. A lower revision and another
+    /// board's target are refused before a byte is sent.
+    #[command(after_help = examples::UPDATE)]
+    Update {
+        #[command(flatten)]
+        update: UpdateArgs,
         #[command(flatten)]
         common: Common,
     },
@@ -273,6 +286,7 @@ impl Command {
             | Self::Attention { common, .. }
             | Self::Drive { common, .. }
             | Self::Hil { common, .. }
+            | Self::Update { common, .. }
             | Self::Score { common, .. }
             | Self::Schema { common, .. } => Some(common),
             Self::Completions(_) => None,
@@ -305,6 +319,7 @@ impl Command {
                 Ok(0)
             }
             Self::Hil { hil, common } => hil.execute(&common, console, progress),
+            Self::Update { update, common } => update.execute(&common, console, progress),
             Self::Score { logs, common } => {
                 let score = metrics::score(&logs)?;
                 console.print(&if common.json { json::score(&score).to_string() } else { terminal::score(&score) });

@@ -10,6 +10,7 @@
 //! * [`emulator`]: the boards of `firmware/boards` in QEMU; [`serial`]: a real one
 //! * [`line`]: bytes both ways, no wait without an end; [`feeder`]: requests and answers; [`session`]: the conversation
 //! * [`pieces`]: the files of a moment as messages; [`expected`]: what must come back; [`compare`]: what did
+//! * [`update`]: a new image over the same line
 //! * [`report`]: what was found; [`messages`]: what the board's program logged on the way
 //!
 //! A log is driven ([`drive`](mod@crate::drive)), with the board's own planner, controller and supervision; frames
@@ -50,6 +51,7 @@ pub mod pieces;
 pub mod report;
 pub mod serial;
 pub mod session;
+pub mod update;
 
 /// Rate of a line unless told otherwise, baud.
 pub const DEFAULT_BAUD: u32 = 115_200;

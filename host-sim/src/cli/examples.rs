@@ -56,6 +56,10 @@ pub const DRIVE: &str = "Examples:
   host-sim drive transfuser.img --log drive/ --model transfuser.pth --report out/
   host-sim drive transfuser.img --log drive/ --json";
 
+pub const UPDATE: &str = "Examples:
+  host-sim update new.img --port /dev/ttyACM0 --baud 1000000
+  host-sim update new.img --board an386 --running old.img";
+
 pub const HIL: &str = "Examples:
   host-sim hil transfuser.img --board an386 --frames frames/
   host-sim hil transfuser.img --board an547 --frames frames/ --steps --json

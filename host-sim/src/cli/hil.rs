@@ -48,7 +48,7 @@ pub(super) struct HilArgs {
 }
 
 #[derive(Debug, Args)]
-struct PlaceArgs {
+pub(super) struct PlaceArgs {
     /// Board of firmware/boards, in QEMU.
     #[arg(long, value_name = "NAME", required_unless_present = "port", conflicts_with = "port")]
     board: Option<Board>,
@@ -83,7 +83,7 @@ struct FeedArgs {
 }
 
 impl PlaceArgs {
-    fn place(self) -> Place {
+    pub(super) fn place(self) -> Place {
         match (self.port, self.board) {
             (Some(device), _) => Place::Port { device, baud: self.baud },
             (None, board) => Place::Emulated { board: board.unwrap_or(Board::An386), program: self.program },

@@ -1,7 +1,7 @@
 //! The feeder's end of the conversation: requests out, answers in, numbered and checked.
 
 use super::line::Line;
-use firmware::link::{Damage, MAX_ENCODED, Receiver, Refusal, Request, Response, decode, encode};
+use firmware::link::{Damage, MAX_ENCODED, Receiver, Refusal, Request, Response, UpdateRefusal, decode, encode};
 use model_compiler::error::{Error, ErrorCode, Result};
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -61,8 +61,16 @@ impl<'l> Feeder<'l> {
     /// of something.
     ///
     /// # Errors
-    /// Nobody answers, or not in this protocol.
+    /// Nobody answers, or not in this protocol, or a board without an image.
     pub fn identify(&mut self) -> Result<Packet> {
+        self.meet()?.ok_or_else(|| self.refused_last(Refusal::NoImage))
+    }
+
+    /// The same, where a board without an image is welcome, too: `None`.
+    ///
+    /// # Errors
+    /// Nobody answers, or not in this protocol.
+    pub fn meet(&mut self) -> Result<Option<Packet>> {
         let begin = Instant::now();
         let mut strange = false;
         // Ends whatever the board was receiving.
@@ -80,10 +88,11 @@ impl<'l> Feeder<'l> {
                 match response {
                     Response::Identity(_) => {
                         self.expected = Some(sequence.wrapping_add(1));
-                        return Ok(Packet(bytes));
+                        return Ok(Some(Packet(bytes)));
                     }
-                    Response::Refused { request, reason: Refusal::NoImage } => {
-                        return Err(self.refused(request, Refusal::NoImage));
+                    Response::Refused { reason: Refusal::NoImage, .. } => {
+                        self.expected = Some(sequence.wrapping_add(1));
+                        return Ok(None);
                     }
                     _ => {}
                 }
@@ -227,7 +236,13 @@ fn remedy(reason: Refusal) -> &'static str {
             "--crop sends the network's inputs in place of the sensors' data"
         }
         Refusal::NoDriver => "only a driving network follows a log; --frames and --inputs run any network",
-        Refusal::NoImage => "flash the image; firmware/boards/README.md says what fits which board",
+        Refusal::NoImage => {
+            "flash an image that is compiled for this board's target; firmware/boards/README.md says which"
+        }
+        Refusal::Update(UpdateRefusal::ForeignTarget { .. }) => "compile it with --target of the board",
+        Refusal::Update(UpdateRefusal::Older { .. }) => "compile it with a higher --revision",
+        Refusal::Update(UpdateRefusal::Running) => "there is nothing to do",
+        Refusal::Update(UpdateRefusal::Arena { .. }) => "compile it with --ram of what there is",
         _ => "",
     }
 }

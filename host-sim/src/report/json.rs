@@ -9,6 +9,7 @@ use crate::drive::DriveReport;
 use crate::footprint::FootprintReport;
 use crate::gates::GateOutcome;
 use crate::hil::report::HilReport;
+use crate::hil::update::UpdateReport;
 use crate::metrics::{RouteLog, Score};
 use crate::run::RunReport;
 use model_compiler::error::{Error, ErrorCode, Result};
@@ -57,6 +58,8 @@ pub enum Document {
     Drive,
     /// Of a run on a board.
     Hil,
+    /// Of an update.
+    Update,
     /// Of footprints.
     Footprint,
     /// The log of a drive, which is read.
@@ -73,6 +76,7 @@ pub fn schema(document: Document) -> Value {
         Document::Score => written().into_root_schema_for::<Score>(),
         Document::Drive => written().into_root_schema_for::<DriveReport>(),
         Document::Hil => written().into_root_schema_for::<HilReport>(),
+        Document::Update => written().into_root_schema_for::<UpdateReport>(),
         Document::Footprint => written().into_root_schema_for::<FootprintReport>(),
         Document::RouteLog => SchemaSettings::default().into_generator().into_root_schema_for::<RouteLog>(),
     };
@@ -139,6 +143,11 @@ pub fn drive(report: &DriveReport) -> Value {
 
 /// Document of a run on a board; one with a difference also has an `error`.
 pub fn hil(report: &HilReport) -> Value {
+    to_value(report)
+}
+
+/// Document of an update.
+pub fn update(report: &UpdateReport) -> Value {
     to_value(report)
 }
 

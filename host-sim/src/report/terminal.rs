@@ -21,7 +21,7 @@ pub use attention::attention;
 pub use bench::bench;
 pub use drive::drive;
 pub use footprint::footprint;
-pub use hil::hil;
+pub use hil::{hil, update};
 pub use run::run;
 pub use score::score;
 

@@ -2,6 +2,7 @@
 
 use super::table;
 use crate::hil::report::{HilFrame, HilReport, LinkFigures, Spread, StepTimes};
+use crate::hil::update::{InstalledImage, UpdateReport};
 use crate::report::figures::figure;
 use std::fmt::Write;
 
@@ -15,6 +16,22 @@ pub fn hil(report: &HilReport) -> String {
         let _ = writeln!(text, "{}\n", steps(&report.steps, unit.name()));
     }
     text + &summary(report)
+}
+
+/// An update in a few lines.
+pub fn update(report: &UpdateReport) -> String {
+    let UpdateReport { board, before, after, bytes_sent, line_s, .. } = report;
+    let shown = |image: &InstalledImage| {
+        let InstalledImage { model, revision, target, qmodel_sha256, bytes } = image;
+        let digest = qmodel_sha256.get(..16).unwrap_or_default();
+        format!("{model}, revision {revision}, for {target}, {bytes} bytes, quantized model {digest}…")
+    };
+    let before = before.as_ref().map_or_else(|| "no image".to_owned(), shown);
+    format!(
+        "{board}\n  before  {before}\n  now     {}, confirmed\n  {bytes_sent} bytes sent, {} s on the line\n",
+        shown(after),
+        figure(Some(*line_s), 1)
+    )
 }
 
 fn frames(report: &HilReport) -> String {
