@@ -140,10 +140,10 @@ fn image_parts() -> ImageParts {
         outputs: vec![port("mean", 2, MEAN_SCALE as f32, 0)],
         arena_bytes: 80,
         arena_alignment: 16,
-        target: String::new(),
-        revision: 0,
         qmodel_digest: [0; 32],
         build_digest: [0; 32],
+        target: String::new(),
+        revision: 0,
         known_answer: None,
     }
 }

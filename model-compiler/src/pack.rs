@@ -55,10 +55,10 @@ pub fn pack(model: &QModel, memory: &MemoryPlan) -> Result<ImageParts> {
         outputs: ports(&model.outputs)?,
         arena_bytes: narrow(memory.arena_bytes, "arena bytes")?,
         arena_alignment: ARENA_ALIGNMENT.max(memory.alignment),
-        target: String::new(),
-        revision: 0,
         qmodel_digest: artifact::sha256(&artifact::to_bytes(model)?),
         build_digest: [0; 32],
+        target: String::new(),
+        revision: 0,
         known_answer: None,
     })
 }

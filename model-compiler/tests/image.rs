@@ -524,10 +524,10 @@ fn page_example() -> ImageParts {
         outputs: vec![port("y", 1)],
         arena_bytes: 32,
         arena_alignment: 16,
-        target: String::new(),
-        revision: 0,
         qmodel_digest: [0; 32],
         build_digest: [0; 32],
+        target: String::new(),
+        revision: 0,
         known_answer: None,
     }
 }

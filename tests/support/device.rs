@@ -46,10 +46,10 @@ pub fn parts(revision: u32, bytes: usize) -> ImageParts {
         outputs: vec![port("y", 1)],
         arena_bytes: 32,
         arena_alignment: 16,
-        target: TARGET.into(),
-        revision,
         qmodel_digest: [0; 32],
         build_digest: [0; 32],
+        target: TARGET.into(),
+        revision,
         known_answer: None,
     }
 }

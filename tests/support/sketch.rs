@@ -163,10 +163,10 @@ impl Sketch {
             outputs: self.outputs.iter().map(port).collect(),
             arena_bytes: offset,
             arena_alignment: 16,
-            target: String::new(),
-            revision: 0,
             qmodel_digest: [0; 32],
             build_digest: [0; 32],
+            target: String::new(),
+            revision: 0,
             known_answer: None,
         }
     }

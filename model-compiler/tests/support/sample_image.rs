@@ -172,10 +172,10 @@ pub fn parts() -> ImageParts {
         ],
         arena_bytes,
         arena_alignment: 16,
-        target: "cortex-m4".into(),
-        revision: 3,
         qmodel_digest: [7; 32],
         build_digest: [9; 32],
+        target: "cortex-m4".into(),
+        revision: 3,
         known_answer: Some(KnownAnswer { seed: 42, step_crcs: vec![0; STEPS] }),
     }
 }
