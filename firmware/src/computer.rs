@@ -9,12 +9,12 @@
 //!
 //! Full brake, no throttle, the wheels as they are, the enable pin low. A drive is in it
 //!
-//! * before the first frame, and after a [`Request::Configure`](crate::link::Request::Configure);
+//! * before the first frame, and after a [`Request::Configure`];
 //! * in a frame that lost a packet: all that its sensors said is taken for missing
-//!   ([`Fault::Missing`](crate::drive::Fault::Missing));
-//! * when the network exceeds its budget ([`Fault::NetworkOverrun`](crate::drive::Fault::NetworkOverrun)): it is given
-//!   up between two steps;
-//! * when no frame ends for longer than the configuration tolerates ([`Fault::Silence`](crate::drive::Fault::Silence));
+//!   ([`Fault::Missing`]);
+//! * when the network exceeds its budget ([`Fault::NetworkOverrun`]): it is given up between
+//!   two steps;
+//! * when no frame ends for longer than the configuration tolerates ([`Fault::Silence`]);
 //! * when a test of image or known answer fails, until the next start;
 //! * for every fault of the [driver](crate::drive::driver) itself.
 //!

@@ -145,10 +145,10 @@ fn image_parts() -> ImageParts {
         inputs: vec![port("rgb", 0, 1.0, -128)],
         outputs: vec![port("mean", 2, MEAN_SCALE as f32, 0)],
         regions: vec![Region { name: RegionName::MAIN, bytes: 80, alignment: 16 }],
-        target: String::new(),
-        revision: 0,
         qmodel_digest: [0; 32],
         build_digest: [0; 32],
+        target: String::new(),
+        revision: 0,
         known_answer: None,
     }
 }

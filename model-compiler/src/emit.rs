@@ -28,14 +28,14 @@ pub struct ImageParts {
     pub outputs: Vec<ImagePort>,
     /// The memory regions, fastest first: one to four, of distinct names.
     pub regions: Vec<Region>,
-    /// Target that the image is compiled for, at most 16 bytes of visible ASCII; empty where unknown.
-    pub target: String,
-    /// Revision of the model: what an update compares.
-    pub revision: u32,
     /// SHA-256 of the quantized model; zeros where unknown.
     pub qmodel_digest: [u8; 32],
     /// Digest that names the build; zeros where unknown.
     pub build_digest: [u8; 32],
+    /// Target that the image is compiled for, at most 16 bytes of visible ASCII; empty where unknown.
+    pub target: String,
+    /// Revision of the model: what an update compares.
+    pub revision: u32,
     /// What every step must give for seeded inputs.
     pub known_answer: Option<KnownAnswer>,
 }

@@ -7,7 +7,7 @@
 //! there, when its search is exhausted, or at a limit of search nodes. It never looks at a clock: same input, same
 //! plan.
 //!
-//! Where a target has several memories, each item goes to one of them first ([`spread`]: the hottest traffic into the
+//! Where a target has several memories, each item goes to one of them first (`spread`: the hottest traffic into the
 //! fastest), and each is packed and judged by itself.
 
 use crate::error::{Error, ErrorCode, Result};

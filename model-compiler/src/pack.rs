@@ -55,10 +55,10 @@ pub fn pack(model: &QModel, memory: &MemoryPlan) -> Result<ImageParts> {
         inputs: ports(&model.inputs)?,
         outputs: ports(&model.outputs)?,
         regions: memory.regions.iter().map(|part| region(part, memory.alignment)).collect::<Result<_>>()?,
-        target: String::new(),
-        revision: 0,
         qmodel_digest: artifact::sha256(&artifact::to_bytes(model)?),
         build_digest: [0; 32],
+        target: String::new(),
+        revision: 0,
         known_answer: None,
     })
 }

@@ -526,10 +526,10 @@ fn page_example() -> ImageParts {
         inputs: vec![port("x", 0)],
         outputs: vec![port("y", 1)],
         regions: vec![Region { name: RegionName::MAIN, bytes: 32, alignment: 16 }],
-        target: String::new(),
-        revision: 0,
         qmodel_digest: [0; 32],
         build_digest: [0; 32],
+        target: String::new(),
+        revision: 0,
         known_answer: None,
     }
 }

@@ -46,10 +46,10 @@ pub fn parts(revision: u32, bytes: usize) -> ImageParts {
         inputs: vec![port("x", 0)],
         outputs: vec![port("y", 1)],
         regions: vec![Region { name: RegionName::MAIN, bytes: 32, alignment: 16 }],
-        target: TARGET.into(),
-        revision,
         qmodel_digest: [0; 32],
         build_digest: [0; 32],
+        target: TARGET.into(),
+        revision,
         known_answer: None,
     }
 }

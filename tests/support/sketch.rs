@@ -163,10 +163,10 @@ impl Sketch {
             inputs: self.inputs.iter().map(port).collect(),
             outputs: self.outputs.iter().map(port).collect(),
             regions: vec![Region { name: RegionName::MAIN, bytes: offset, alignment: 16 }],
-            target: String::new(),
-            revision: 0,
             qmodel_digest: [0; 32],
             build_digest: [0; 32],
+            target: String::new(),
+            revision: 0,
             known_answer: None,
         }
     }

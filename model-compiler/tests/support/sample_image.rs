@@ -171,10 +171,10 @@ pub fn parts() -> ImageParts {
             ImagePort { scale: 1.0 / 64.0, ..port("points", ids::POINTS) },
         ],
         regions: vec![Region { name: RegionName::MAIN, bytes: arena_bytes, alignment: 16 }],
-        target: "cortex-m4".into(),
-        revision: 3,
         qmodel_digest: [7; 32],
         build_digest: [9; 32],
+        target: "cortex-m4".into(),
+        revision: 3,
         known_answer: Some(KnownAnswer { seed: 42, step_crcs: vec![0; STEPS] }),
     }
 }

@@ -6,7 +6,7 @@ use embedded_storage::nor_flash::{check_erase, check_read, check_write};
 use firmware::image::{CheckProgress, Image, crc32};
 use firmware::kernels::{Kernels, Portable};
 use firmware::update::{CLAIM, Manifest, MappedFlash, Requirements, Slots, TRIALS, Updater, select};
-use libfuzzer_sys::arbitrary::{Arbitrary, Result, Unstructured};
+use libfuzzer_sys::arbitrary::{Result, Unstructured};
 use libfuzzer_sys::fuzz_target;
 use model_compiler::emit::{AlignedBytes, reseal};
 use std::ops::Range;
@@ -73,7 +73,8 @@ impl MappedFlash for Flash {
 
 /// What a slot holds: an image with valid CRCs or anything, and a record that may be one.
 fn fill(u: &mut Unstructured<'_>, slot: &mut [u8]) -> Result<()> {
-    let image = u.bytes(u.arbitrary_len::<u8>()?.min(IMAGE))?;
+    let length = u.arbitrary_len::<u8>()?.min(IMAGE);
+    let image = u.bytes(length)?;
     slot[..image.len()].copy_from_slice(image);
     if u.arbitrary()? {
         reseal(&mut slot[..image.len()]);
@@ -85,7 +86,8 @@ fn fill(u: &mut Unstructured<'_>, slot: &mut [u8]) -> Result<()> {
     }
     if u.arbitrary()? {
         let header_crc = slot.get(380..384).unwrap_or_default().to_vec();
-        let body = [&u.arbitrary::<u32>()?.to_le_bytes()[..], &(image.len() as u32).to_le_bytes(), &header_crc].concat();
+        let body =
+            [&u.arbitrary::<u32>()?.to_le_bytes()[..], &(image.len() as u32).to_le_bytes(), &header_crc].concat();
         let record = [&CLAIM[..], &body, &crc32(&body).to_le_bytes()].concat();
         slot[IMAGE..][..record.len()].copy_from_slice(&record);
     }
@@ -101,7 +103,8 @@ fn receive(u: &mut Unstructured<'_>, mut flash: Flash, slots: Slots) -> Result<(
         let image = Image::parse(flash.mapped(running.range()).expect("it lies in the flash")).expect("it is an image");
         image.check().expect("every byte was checked");
     }
-    let sent = AlignedBytes::from(u.bytes(u.arbitrary_len::<u8>()?.min(IMAGE))?);
+    let length = u.arbitrary_len::<u8>()?.min(IMAGE);
+    let sent = AlignedBytes::from(u.bytes(length)?);
     let Ok(image) = Image::parse(&sent) else { return Ok(()) };
     let mut updater = Updater::new(flash, slots, requirements, running);
     let _ = updater.confirm();
