@@ -8,7 +8,7 @@
 //! ```
 //!
 //! * [`emulator`]: the boards of `firmware/boards` in QEMU; [`serial`]: a real one
-//! * [`line`]: bytes both ways, no wait without an end; [`feeder`]: requests and answers; [`session`]: the conversation
+//! * [`line`](mod@line): bytes both ways, no wait without an end; [`feeder`]: requests and answers; [`session`]: the conversation
 //! * [`pieces`]: the files of a moment as messages; [`expected`]: what must come back; [`compare`]: what did
 //! * [`update`]: a new image over the same line
 //! * [`report`]: what was found; [`messages`]: what the board's program logged on the way
