@@ -142,6 +142,8 @@ fn is_table_jump(function: &Function<'_>, at: usize) -> bool {
     for back in (0..at).rev().step_by(4).map(|end| end - 3).take(TABLE_JUMP_REACH) {
         let word = word(&function.code[back..]);
         let [first, second, third] = [word & 31, word >> 5 & 31, word >> 10 & 31];
+        // Loads of pairs and exclusive ones have a second register; elsewhere these digits are a number.
+        let is_pair = word & 0x3A00_0000 == 0x2800_0000 || word & 0x3F00_0000 == 0x0800_0000;
         let is_sum = word & 0xFF20_0000 == 0x8B00_0000 && first == register && second == register;
         if word & 0x9F00_0000 == 0x1000_0000 && first == register {
             let value = (word >> 5 & 0x7_FFFF) << 2 | word >> 29 & 3;
@@ -150,7 +152,7 @@ fn is_table_jump(function: &Function<'_>, at: usize) -> bool {
         }
         if is_sum && !has_sum {
             has_sum = true;
-        } else if [first, second, third].contains(&register) || a64(word, 0) != Flow::Next {
+        } else if [first, second].contains(&register) || is_pair && third == register || a64(word, 0) != Flow::Next {
             return false;
         }
     }
@@ -205,6 +207,8 @@ mod tests {
         let (adr, ldrb, add, mov, br) = (0x1000_008A, 0x3868_692B, 0x8B0B_094A, 0xAA14_03E0, 0xD61F_0140);
         assert_eq!(indirect(&[adr, ldrb, add, mov, br]), 0);
         assert_eq!(indirect(&[adr, ldrb, mov, br]), 1, "no entry of a table");
+        assert_eq!(indirect(&[adr, ldrb, add, 0xF940_2BE0, br]), 0, "ldr x0, [sp, #80]: 80 is 8 times 10");
+        assert_eq!(indirect(&[adr, ldrb, add, 0xA942_2BEC, br]), 1, "ldp x12, x10, [sp, #32]");
         assert_eq!(indirect(&[ldrb, add, mov, br]), 1, "of an unknown address");
         assert_eq!(indirect(&[adr, ldrb, add, 0xF940_0D0A, br]), 1, "ldr x10, [x8, #24]");
         assert_eq!(indirect(&[0x1001_000A, ldrb, add, mov, br]), 1, "adr x10 beyond the function");
