@@ -71,7 +71,7 @@ fn measure<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -
     say(machine, checked)?;
     let check_stack = mark.depth_bytes();
 
-    let mut engine = say(machine, Engine::new(image, *kernels, arena))?;
+    let mut engine = say(machine, Engine::new(image, *kernels, &mut **arena))?;
     let frame_bytes = frame_bytes(&image).ok_or(fmt::Error)?;
     let frames = behind.strip_prefix(b"FRAMES\0\0").and_then(|frames| frames.split_first_chunk());
     let (count, frames) = frames.map_or((0, &[][..]), |(count, frames)| (u32::from_le_bytes(*count), frames));

@@ -36,7 +36,7 @@ fn test<U: Uart, C: Counter, K: Kernels + Copy>(bench: &mut Bench<U, C, K>) -> f
         arena.len()
     )?;
     say(machine, image.check())?;
-    let mut engine = say(machine, Engine::new(image, *kernels, arena))?;
+    let mut engine = say(machine, Engine::new(image, *kernels, &mut **arena))?;
     say(machine, engine.start_self_test())?;
     let mut total = 0;
     for position in 0.. {
