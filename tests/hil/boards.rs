@@ -35,7 +35,9 @@ fn assert_gives_every_byte(board: Board) {
     let summary = &document["summary"];
     assert_eq!((&summary["frames"], &summary["equal"], &summary["bytes_compared"]), (&3.into(), &3.into(), &96.into()));
     assert_eq!((&summary["link"]["lost"], &summary["link"]["overflowed"]), (&0.into(), &0.into()), "{summary}");
-    assert_eq!((&summary["self_tests"], &document["unit"]), (&1.into(), &"instructions".into()));
+    // The one that was asked for; a board that waits tests itself, too.
+    assert!(summary["self_tests"].as_u64() >= Some(1), "{summary}");
+    assert_eq!(document["unit"], "instructions");
     assert_eq!(frames(&document).len(), 3);
     println!("{}: {summary}", board.name());
 }
