@@ -192,6 +192,7 @@ fn converse<B: Board, A: Actuate, K: Kernels, S: ImageStore>(
             desk.idle();
             continue;
         };
+        desk.hear();
         match receiver.push(byte) {
             None => {}
             Some(Err(_)) => desk.lent.sender.count_damaged(),

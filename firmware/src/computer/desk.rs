@@ -19,6 +19,11 @@ use crate::link::{StepReport, Telemetry};
 /// Most ticks without a frame that the schedule is told one by one; of more it is told as many, even or odd.
 const MAX_SKIPPED: u32 = 64;
 
+/// How long nothing must have come before a slice of the test is run, milliseconds.
+const QUIET_MS: u64 = 20;
+/// The same, while a new image is coming.
+const QUIET_UPDATE_MS: u64 = 10_000;
+
 /// Why a drive ends.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(super) enum End {
@@ -57,6 +62,10 @@ pub(super) struct Desk<'i, 'a, 'm, B, A, K, S> {
     times: StartTimes,
     frame: Option<Frame>,
     last_frame: Option<u32>,
+    /// When the last byte came.
+    last_byte: u64,
+    /// A new image was announced and is not installed yet.
+    is_updating: bool,
     /// When the last frame of a drive ended, or the vehicle was last stopped for silence.
     last_end: Option<u64>,
     /// A piece without a frame was refused already.
@@ -85,14 +94,28 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels, S: ImageStore> Desk<'i, 'a, '
             times,
             frame: None,
             last_frame: None,
+            last_byte: 0,
+            is_updating: false,
             last_end: None,
             is_refused: false,
         }
     }
 
+    /// A byte was received.
+    pub fn hear(&mut self) {
+        self.last_byte = self.lent.board.ticks();
+    }
+
     /// Nothing was received: watches the silence, tests a slice.
     pub fn idle(&mut self) {
         self.watch_silence();
+        // A slice may take as long as a step of the network: not in the middle of a conversation.
+        let quiet_ms = if self.is_updating { QUIET_UPDATE_MS } else { QUIET_MS };
+        let quiet = quiet_ms.saturating_mul(self.lent.board.hertz()) / 1000;
+        if self.lent.board.ticks().wrapping_sub(self.last_byte) < quiet {
+            self.lent.board.wait();
+            return;
+        }
         let is_wanted = self.configuration.tests_in_background
             || (self.configuration.needs_self_test && self.lent.test.passed() == 0);
         // The arena holds the inputs of a frame under way.
@@ -158,7 +181,9 @@ impl<'i, 'a, 'm, B: Board, A: Actuate, K: Kernels, S: ImageStore> Desk<'i, 'a, '
                     board.feed_watchdog();
                     sender.take_in(board);
                 };
-                store::carry_out(*store, &request, *board, between).unwrap_or(Ok(()))
+                let outcome = store::carry_out(*store, &request, *board, between).unwrap_or(Ok(()));
+                self.is_updating = outcome.is_ok() && !matches!(request, Request::Install);
+                outcome
             }
             Request::Begin { frame, detail } => return self.silently(sequence, |desk| desk.begin(frame, detail)),
             Request::Row { view, row, offset, bytes } => {

@@ -12,6 +12,9 @@ use firmware::image::Image;
 use firmware::kernels::Kernels;
 use firmware::update::{self, Requirements, Updater};
 
+/// Rounds of a pause, some microseconds.
+const PAUSE: u32 = 200;
+
 /// What the computer works with beside arena and stack.
 #[derive(Debug)]
 pub struct Workspace {
@@ -80,6 +83,13 @@ impl<U: Uart, C: Counter> computer::Board for Machine<U, C> {
 
     /// The emulated boards run without one.
     fn feed_watchdog(&mut self) {}
+
+    /// A while without a register: each access to one holds the emulator up, which is to fetch the next byte meanwhile.
+    fn wait(&mut self) {
+        for _ in 0..PAUSE {
+            core::hint::spin_loop();
+        }
+    }
 
     fn stack_bytes(&self) -> Option<u32> {
         u32::try_from(stack::peak_bytes()).ok()
