@@ -188,31 +188,34 @@ pub unsafe extern "C" fn fw_engine_init(
         if !regions.is_aligned() {
             return Err(Status::Misaligned);
         }
-        if !(1..=MAX_REGIONS).contains(&region_count) {
+        let bytes = place(image, image_bytes)?;
+        if overlap(bytes, storage(engine)) {
+            return Err(Status::Overlap);
+        }
+        // SAFETY: the caller vouches for the bytes and keeps them unchanged as long as the engine is used.
+        let image = Image::parse(unsafe { memory(bytes) })?;
+        if region_count != usize::from(image.region_count()) {
             return Err(Status::RegionCount);
         }
-        let image = place(image, image_bytes)?;
         let mut arena = [NOWHERE; MAX_REGIONS];
         for index in 0..region_count {
             // SAFETY: not null, aligned, and the caller vouches for `region_count` of them.
             let region = unsafe { regions.wrapping_add(index).read() };
             let region = place(region.memory, region.bytes)?;
-            if [image, storage(engine)].iter().chain(&arena).any(|other| overlap(region, *other)) {
+            if [bytes, storage(engine)].iter().chain(&arena).any(|other| overlap(region, *other)) {
                 return Err(Status::Overlap);
             }
             if let Some(slot) = arena.get_mut(index) {
                 *slot = region;
             }
         }
-        if overlap(image, storage(engine)) {
-            return Err(Status::Overlap);
-        }
-        // SAFETY: the caller vouches for the bytes and keeps them unchanged as long as the engine is used.
-        let image: &'static [u8] = unsafe { memory(image) };
-        // SAFETY: the caller gives the regions to this engine alone; they share no byte with each other, engine or image.
-        let lend = |region: &Place| -> &'static mut [u8] { unsafe { memory_mut(*region) } };
+        let lend = |region: &Place| -> &'static mut [u8] {
+            // SAFETY: the caller gives the regions to this engine alone; they share no byte with each other, the engine
+            // or the image.
+            unsafe { memory_mut(*region) }
+        };
         let regions: Regions<'static> = arena.iter().take(region_count).map(lend).collect();
-        let engine = Engine::new(Image::parse(image)?, Portable, regions)?;
+        let engine = Engine::new(image, Portable, regions)?;
         // SAFETY: the storage is aligned and large enough for the state (asserted above), and the caller's to give.
         unsafe { state.write(State { mark: MARK, error: None, arena, engine }) };
         Ok(())

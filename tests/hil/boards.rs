@@ -28,7 +28,7 @@ fn assert_gives_every_byte(board: Board) {
     if !is_there(board) {
         return;
     }
-    let folder = bundled();
+    let folder = bundled(board.target());
     let command = format!("host-sim hil @net.img --board {} --frames @frames --json", board.name());
     let (status, document) = folder.json(&command);
     assert_eq!(status, 0, "{document:#}");
@@ -65,7 +65,8 @@ fn the_cortex_a_gives_every_byte() {
 /// Both ways to restart: a Cortex-M's own, and the firmware's of a Cortex-A.
 #[test]
 fn a_new_image_is_installed_started_and_confirmed() {
-    for (board, target, foreign) in [(Board::An386, "cortex-m4", "cortex-a"), (Board::Virt, "cortex-a", "cortex-m4")] {
+    for (board, other) in [(Board::An386, Board::Virt), (Board::Virt, Board::An386)] {
+        let [target, foreign] = [board, other].map(Board::target);
         if !is_there(board) {
             continue;
         }

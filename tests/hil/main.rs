@@ -21,8 +21,8 @@ const CAMERAS: [&str; 3] = ["rgb.png", "rgb_left.png", "rgb_right.png"];
 /// Height and width of LBC's views: a firmware draws its goal on no others.
 const LBC_SIZE: (u16, u16) = (144, 256);
 
-/// The bundled network for a microcontroller (`net.img`), and its evaluation frames (`frames`).
-fn bundled() -> Folder {
+/// The bundled network for a target (`net.img`), and its evaluation frames (`frames`).
+fn bundled(target: &str) -> Folder {
     let folder = Folder::default();
     fs::copy(bundle::checkpoint_path(), folder.path("net.safetensors")).expect("the bundled checkpoint");
     for (from, to) in [("calibration", "calib"), ("evaluation", "frames")] {
@@ -35,7 +35,7 @@ fn bundled() -> Folder {
             }
         }
     }
-    folder.ok("model-compiler compile @net.safetensors --calib @calib --target cortex-m4 -o @net.img");
+    folder.ok(&format!("model-compiler compile @net.safetensors --calib @calib --target {target} -o @net.img"));
     folder
 }
 
@@ -91,7 +91,7 @@ fn frames(document: &Value) -> &[Value] {
 
 #[test]
 fn every_byte_of_the_bundled_frames_is_the_hosts() {
-    let folder = bundled();
+    let folder = bundled("cortex-m4");
     let board = board(&folder);
     let by_sensors = hil(&folder, &board, "--frames @frames --steps");
     let by_inputs = hil(&folder, &board, "--frames @frames --crop");

@@ -128,7 +128,7 @@ fn a64(word: u32, address: u64) -> Flow {
 }
 
 /// Instructions that lie at most between the parts of a jump through a table.
-const TABLE_JUMP_REACH: usize = 16;
+const TABLE_JUMP_REACH: usize = 32;
 
 /// Whether an A64 instruction is the end of a `match`: a BR to a register that holds the sum of an address inside the
 /// function (ADR) and an entry of a table (ADD). Anything else that may write the register in between ends the search.

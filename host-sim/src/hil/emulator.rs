@@ -55,6 +55,16 @@ impl Board {
         }
     }
 
+    /// Name of the target that images for it are compiled for.
+    pub const fn target(self) -> &'static str {
+        match self {
+            Self::An386 => "cortex-m4",
+            Self::An500 => "cortex-m7",
+            Self::An547 => "cortex-m55",
+            Self::Virt => "cortex-a",
+        }
+    }
+
     /// The emulator of its core.
     pub const fn emulator(self) -> &'static str {
         match self {

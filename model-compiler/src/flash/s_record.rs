@@ -37,8 +37,8 @@ mod tests {
     fn records_are_those_of_the_format_s_description() {
         let mut text = String::new();
         put(&mut text, '0', &[0, 0], b"HDR");
-        put(&mut text, '1', &[0x00, 0x38], b"HELLO WORLD.\n\0");
+        put(&mut text, '1', &[0x00, 0x38], b"Hello world.\n\0");
         put(&mut text, '9', &[0, 0], &[]);
-        assert_eq!(text, "S00600004844521B\nS111003848454C4C4F20574F524C442E0A0042\nS9030000FC\n");
+        assert_eq!(text, "S00600004844521B\nS111003848656C6C6F20776F726C642E0A0042\nS9030000FC\n");
     }
 }
