@@ -18,7 +18,7 @@ use tests::{every_step, mutation, sketch};
 /// Seed of the random edits.
 const SEED: u64 = 0x5EED;
 /// Images with random edits.
-const EDITS: usize = 1_000_000;
+const EDITS: usize = 500_000;
 const THREADS: usize = 2;
 
 static TURN: Mutex<()> = Mutex::new(());

@@ -18,19 +18,21 @@
 //!
 //! A program in outline:
 //!
-//!     static fw_engine engine;
-//!     static _Alignas(64) uint8_t arena[160 * 1024];
+//! ```c
+//! static fw_engine engine;
+//! static _Alignas(64) uint8_t arena[160 * 1024];
 //!
-//!     fw_region region = { arena, sizeof arena };
-//!     fw_status status = fw_engine_init(&engine, image, image_bytes, &region, 1);
-//!     if (status == FW_STATUS_OK) status = fw_self_test(&engine);
+//! fw_region region = { arena, sizeof arena };
+//! fw_status status = fw_engine_init(&engine, image, image_bytes, &region, 1);
+//! if (status == FW_STATUS_OK) status = fw_self_test(&engine);
 //!
-//!     for each frame:
-//!         fw_input(&engine, i, &bytes, &length), then fill bytes[0..length], for every input i
-//!         fw_begin(&engine);
-//!         do status = fw_step(&engine, &progress);   // between two steps: feed the watchdog, yield
-//!         while (status == FW_STATUS_OK && progress.done < progress.steps);
-//!         fw_waypoints(&engine, 0, waypoints, FW_MAX_WAYPOINTS, &count);
+//! for each frame:
+//!     fw_input(&engine, i, &bytes, &length), then fill bytes[0..length], for every input i
+//!     fw_begin(&engine);
+//!     do status = fw_step(&engine, &progress);   // between two steps: feed the watchdog, yield
+//!     while (status == FW_STATUS_OK && progress.done < progress.steps);
+//!     fw_waypoints(&engine, 0, waypoints, FW_MAX_WAYPOINTS, &count);
+//! ```
 
 #![allow(unsafe_code, reason = "C has only pointers; every block says why it is sound")]
 #![allow(clippy::missing_safety_doc, reason = "the module page says what every caller owes")]

@@ -42,7 +42,9 @@ fn firmware(file: &str) -> PathBuf {
 pub fn generate() -> String {
     let interface = firmware("src/ffi.rs");
     let page = fs::read_to_string(&interface).unwrap_or_else(|e| panic!("{}: {e}", interface.display()));
-    let page: Vec<&str> = page.lines().map_while(|line| line.strip_prefix("//!")).collect();
+    let page = page.lines().map_while(|line| line.strip_prefix("//!"));
+    // What marks code in the documentation is none in a comment.
+    let page: Vec<&str> = page.filter(|line| !line.starts_with(" ```")).collect();
     let config = Config {
         language: Language::C,
         style: Style::Both,
